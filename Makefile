@@ -1,0 +1,50 @@
+# Everything a person or CI needs. `make demo` first; `make help` lists the rest.
+SHELL := /bin/bash
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SYSTEM := python3-venv python3-gi gir1.2-aravis-0.8 libgl1 libegl1 libx11-6 libusb-1.0-0 libudev1 libgomp1
+TEST_SYSTEM := chromium mbpoll
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
+ARGS ?=
+
+.PHONY: help demo test check bench lint schema install install-test clean
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+demo: $(STAMP)  ## the simulated cell: two GigE cameras, the daemon, a PLC that empties the bin (ARGS="--headless --cycles 5")
+	@$(BIN)/binpick demo $(ARGS)
+
+install: $(STAMP)  ## system packages and the virtual environment
+
+$(STAMP): pyproject.toml constraints.txt
+	@deploy/install-packages $(SYSTEM)
+	@test -x $(BIN)/python || /usr/bin/python3 -m venv --system-site-packages $(VENV)
+	@echo "Installing Python packages (about 1.5 GB on disk, 2 to 5 minutes) ..."
+	@$(PIP) --quiet --progress-bar on hatchling editables
+	@$(PIP) --progress-bar on --no-build-isolation --editable '.[sim,dev]' | grep -vE '^(Looking|Requirement already|Obtaining|  Preparing|  Getting|  Checking)' || test $${PIPESTATUS[0]} -eq 0
+	@touch $@
+
+install-test: $(STAMP)
+	@deploy/install-packages $(TEST_SYSTEM)
+
+lint: $(STAMP)
+	$(BIN)/ruff check service calib tests
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+check: lint  ## lint, types, contracts, unit and contract tests, one in-process cycle (90 s)
+	$(BIN)/pytest -q -m "not slow and not browser"
+
+test: install-test lint  ## everything that CI runs
+	$(BIN)/pytest
+
+bench: $(STAMP)  ## accuracy and speed against the textbook pipeline, on the frozen exam
+	$(BIN)/binpick bench $(ARGS)
+
+schema: $(STAMP)  ## regenerate the generated files
+	$(BIN)/binpick schema --write deploy
+
+clean:  ## remove what was installed and built
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache out

@@ -1,0 +1,1 @@
+"""The calibration tool: boards in, a rig file out."""

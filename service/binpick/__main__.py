@@ -1,0 +1,5 @@
+"""`python -m binpick` is `binpick`."""
+
+from binpick.cli import main
+
+main()

@@ -1,0 +1,1 @@
+"""The cameras: one protocol, its backends, and two of them as one instrument."""

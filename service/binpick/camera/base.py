@@ -1,0 +1,52 @@
+"""What a camera is to the rest: five verbs, each bounded by a deadline, and a status anybody may read at any time."""
+
+import time
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
+
+from binpick.data import CameraStatus, Frame, Light
+
+MonotonicNs: TypeAlias = int
+Clock: TypeAlias = Callable[[], MonotonicNs]
+
+
+class Camera(Protocol):
+    """One triggered camera, called by one thread at a time.
+
+    No verb may block beyond `deadline_ns` (host monotonic clock), whatever the camera or its driver does; a verb that cannot
+    end by then raises CameraLost. After an error the camera is closed and opened again by its caller.
+    """
+
+    @property
+    def name(self) -> str:
+        """"left" or "right"; named in every error."""
+        ...
+
+    def open(self, deadline_ns: MonotonicNs) -> None:
+        """Connect and prepare for triggers. Raises CameraNotFound, CameraHeld, CameraLost."""
+        ...
+
+    def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
+        """Apply exposure and gain, read back. Raises CameraError."""
+        ...
+
+    def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+        """Start one exposure. Raises CameraLost."""
+        ...
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+        """The whole frame of that trigger; older ones are dropped. Raises CameraLost, PairRefused (incomplete)."""
+        ...
+
+    def close(self) -> None:
+        """Give the camera back within 1 s, or abandon it; never raises."""
+        ...
+
+    def status(self) -> CameraStatus:
+        """What it knows of itself, without waiting."""
+        ...
+
+
+def remaining_s(deadline_ns: MonotonicNs, clock: Clock = time.monotonic_ns) -> float:
+    """Seconds left before a deadline, at least 0."""
+    return max(0.0, (deadline_ns - clock()) / 1e9)

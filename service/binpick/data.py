@@ -1,0 +1,180 @@
+"""The frozen values that flow from stage to stage; arrays carry shape and dtype, NaN means not measured."""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
+
+from binpick.geometry import Transform
+
+Image: TypeAlias = UInt8[np.ndarray, "h w"]
+Disparity: TypeAlias = Float32[np.ndarray, "h w"]
+Cloud: TypeAlias = Float32[np.ndarray, "h w 3"]
+Mask: TypeAlias = Bool[np.ndarray, "h w"]
+Labels: TypeAlias = Int32[np.ndarray, "h w"]
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    """The same array, read-only from here on: stages hand over values, not workspaces."""
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Light:
+    """What a shot is exposed with."""
+
+    exposure_us: float
+    gain_db: float
+    projector: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of one camera, with the facts that prove which instant it shows.
+
+    `timestamp_ns` is the start of exposure in the device's own clock; `triggered_ns` and `received_ns` are the host's
+    monotonic clock. `sequence` is the group's trigger counter, `frame_id` the camera's own.
+    """
+
+    image: Image
+    camera: str
+    sequence: int
+    frame_id: int
+    timestamp_ns: int
+    triggered_ns: int
+    received_ns: int
+    exposure_us: float
+    gain_db: float
+    resends: int = 0
+    missing: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoPair:
+    """Two frames of one trigger. `proof` names what the skew rests on; captured_at is ISO 8601 UTC wall time."""
+
+    left: Frame
+    right: Frame
+    captured_at: str
+    skew_us: float
+    sigma_us: float
+    proof: str
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStatus:
+    """What a camera says of itself; `error` is empty when it is well."""
+
+    name: str
+    connected: bool
+    model: str = ""
+    serial: str = ""
+    address: str = ""
+    frames: int = 0
+    failures: int = 0
+    resends: int = 0
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The pixels of the rectified left view that can show the bin's box, and the disparities it can have."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    min_disparity: int
+    num_disparities: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectified:
+    """The window of both views on common rows; in `right` a point stands disparity − min_disparity px further left.
+
+    Both images carry `margin` more columns on the left than the window, so that every window pixel has its whole search
+    range. `focal_px`, `baseline_m` and the principal point belong to the rectified left view, its pixel (0, 0) being the
+    whole view's; R_rect_camera turns camera directions into rect ones.
+    """
+
+    left: Image
+    right: Image
+    window: Window
+    margin: int
+    focal_px: float
+    baseline_m: float
+    cx_px: float
+    cy_px: float
+    T_camera_rect: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Depth:
+    """Disparity of the window's pixels in px, absolute. `measured` gates it: elsewhere `disparity` is NaN.
+
+    `filled` is the smoothed map for people; never a grasp's evidence. `sigma_px` is the 1-sigma noise of a measured pixel.
+    """
+
+    disparity: Disparity
+    filled: Disparity
+    confidence: UInt8[np.ndarray, "h w"]
+    measured: Mask
+    sigma_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrganisedCloud:
+    """XYZ on the window's pixel grid, frame `camera`, metres, NaN = not measured; sigma_z_m travels with it."""
+
+    xyz: Cloud
+    sigma_z_m: Float32[np.ndarray, "h w"]
+    window: Window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightMap:
+    """Heights above the bin's floor on a square grid over the bin's inside, frame `bin`, metres.
+
+    `height` is NaN where nothing was measured; `watertight` has no holes: unseen cells hold the highest thing that could hide
+    them. Cell (i, j) covers x from origin_x_m + j * cell_m and y from origin_y_m + i * cell_m.
+    """
+
+    height: Float32[np.ndarray, "rows cols"]
+    watertight: Float32[np.ndarray, "rows cols"]
+    cell_m: float
+    origin_x_m: float
+    origin_y_m: float
+    coverage: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Faces (for suction) and parts (ownership) on the same grid as `xyz`; label 0 is nobody.
+
+    `xyz` and `normal` are frame `bin`, `normal` points away from the surface towards the camera.
+    """
+
+    xyz: Cloud
+    normal: Cloud
+    faces: Labels
+    parts: Labels
+    part_confidence: dict[int, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grasp:
+    """A candidate while it is being judged; T_bin_tcp as in a published pose, z into the object."""
+
+    T_bin_tcp: Transform
+    tool: int
+    part_id: int
+    open_m: float
+    close_m: float
+    quality: float
+    seal_rms_m: float
+    sigma_xy_m: float
+    sigma_z_m: float
+    sigma_tilt_rad: float
+    clearance_m: float = float("nan")

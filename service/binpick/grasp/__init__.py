@@ -1,0 +1,1 @@
+"""Grasp candidates, what they would hit, and their order."""

@@ -1,0 +1,1 @@
+"""Measures the product against ground truth; never imported by it."""

@@ -1,0 +1,1 @@
+"""Publishers show one snapshot and compute nothing; they reach the cell only through `ports`."""

@@ -1,0 +1,68 @@
+"""All that a publisher knows of the cell: what it may read, and what it may ask for."""
+
+import asyncio
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from binpick.result import Request, Result, Snapshot
+
+Source = Literal["modbus", "rest"]
+
+
+@dataclass(frozen=True, slots=True)
+class Artefact:
+    """A picture or a cloud of a finished cycle."""
+
+    media_type: str
+    body: bytes
+
+
+class View(Protocol):
+    """Reading; every call returns at once with what is true now."""
+
+    def snapshot(self) -> Snapshot:
+        """The one immutable state all interfaces show."""
+        ...
+
+    def subscribe(self) -> asyncio.Event:
+        """An event of the running loop, set at every new snapshot; clear it before looking. Drop it with `unsubscribe`."""
+        ...
+
+    def unsubscribe(self, event: asyncio.Event) -> None:
+        """Ends a subscription."""
+        ...
+
+    def result(self, cycle_id: int) -> Result | None:
+        """A finished cycle still in memory (the last 16), or None."""
+        ...
+
+    def artefact(self, cycle_id: int, name: str) -> Artefact | None:
+        """cloud.ply, overlay.png, disparity.png, confidence.png, left.png or right.png of the last cycle kept.
+
+        None when that cycle or name is not there. Takes tens of milliseconds: call it off the loop.
+        """
+        ...
+
+
+class Control(Protocol):
+    """Asking; refused with CycleRefused when the cell is busy, not ready, or owned by another interface."""
+
+    def start(self, request: Request, source: Source) -> int:
+        """Starts a cycle and returns its id at once; raises Busy, NotReady, NotInControl, UnknownItem, FrameUnavailable."""
+        ...
+
+    def abort(self, cycle_id: int, source: Source) -> None:
+        """Retires a running cycle (−26); raises NotApplicable when it is not running."""
+        ...
+
+    def acknowledge(self, cycle_id: int, source: Source) -> None:
+        """The controller has read the published result, which stops being valid."""
+        ...
+
+    def withdraw(self, reason: str, source: Source) -> None:
+        """Takes back what is published or running, as when the controller went away."""
+        ...
+
+    def report(self, cycle_id: int, grasp: int, outcome: int, source: Source) -> None:
+        """What became of a grasp (1 ok, 2 missed, ... CONTRACTS); idempotent; raises NotApplicable for unknown ones."""
+        ...

@@ -1,0 +1,258 @@
+"""What a cycle reads, what it answers (schema binpick-result/1), and the snapshot that every interface shows.
+
+A `Result` is made once per cycle and serialised once to bytes; REST sends those bytes, the registers are filled from the same
+object. Lengths are metres, angles radians, times milliseconds where the name says so.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
+from binpick.errors import Code
+from binpick.rig import Rig
+from binpick.settings import Job
+
+Triple = tuple[float, float, float]
+Xyzw = tuple[float, float, float, float]
+FrameName = Literal["camera", "bin", "base"]
+
+
+class Wire(BaseModel):
+    """Frozen; unknown keys and NaN are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class PoseMessage(Wire):
+    """A pose: position in metres and a unit quaternion."""
+
+    position_m: Triple
+    quaternion_xyzw: Xyzw
+
+
+class Request(Wire):
+    """What a client asks of one cycle; 0, null and "" mean the recipe's own."""
+
+    recipe: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Recipe number; 0: the first."""
+    bin: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Bin number; 0: the recipe's."""
+    tool: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Tool number; 0: the recipe's."""
+    frame: FrameName | None = None
+    """Frame of the poses; null: the recipe's."""
+    max_grasps: Annotated[int, Field(ge=0, le=20)] = 0
+    """Most grasps to return; 0: the recipe's."""
+    pose_format: Literal["quaternion_xyzw", "rotvec_rad", "kuka_abc_deg", "fanuc_wpr_deg", "ur_rxryrz_rad"] | None = None
+    """Orientation on Modbus; null: the recipe's. REST always carries the quaternion."""
+    timeout_ms: Annotated[int, Field(ge=0, le=60000)] = 0
+    """Time limit of the cycle, ms; 0: the cell's."""
+    request_id: Annotated[str, Field(max_length=64)] = ""
+    """Echoed in the result."""
+    T_base_flange: PoseMessage | None = None
+    """The flange when the cameras ride on it."""
+
+
+class ReturnCode(Wire):
+    """The cycle's outcome."""
+
+    value: int
+    name: str
+    message: str
+
+    @classmethod
+    def of(cls, code: Code, message: str = "") -> "ReturnCode":
+        """The code with its own sentence, or a more exact one."""
+        return cls(value=code.value, name=code.name.lower(), message=message or code.message)
+
+    @property
+    def code(self) -> Code:
+        """As the enum."""
+        return Code(self.value)
+
+
+class BinMessage(Wire):
+    """The bin as used: its pose in the camera frame, and how full it is (0 to 1 of its height, mean over measured cells)."""
+
+    found: bool
+    number: int
+    T_camera_bin: PoseMessage | None
+    fill_level: float | None
+    coverage: float | None
+
+
+class Sigma(Wire):
+    """1-sigma uncertainty of a grasp from depth noise."""
+
+    xy_m: float
+    z_m: float
+    tilt_rad: float
+
+
+class ToolMessage(Wire):
+    """The tool a grasp is for."""
+
+    number: int
+    name: str
+    kind: str
+
+
+class GraspMessage(Wire):
+    """One grasp: T_frame_tcp, z into the object; the only motion checked is pregrasp -> pose -> lift (along the bin's z)."""
+
+    id: str
+    rank: int
+    tool: ToolMessage
+    frame: FrameName
+    position_m: Triple
+    quaternion_xyzw: Xyzw
+    T_frame_pregrasp: PoseMessage
+    approach_m: float
+    lift_m: float
+    open_m: float
+    close_m: float
+    quality: Annotated[float, Field(ge=0, le=1)]
+    sigma: Sigma
+    clearance_m: float
+    part_id: int
+
+    @property
+    def number(self) -> int:
+        """The grasp's number within its cycle, 1 and up; `id` is "<cycle>-<number>"."""
+        return int(self.id.rsplit("-", 1)[1])
+
+
+class Funnel(Wire):
+    """How many candidates each stage left, and why most of the others fell out ("" when none did)."""
+
+    counts: dict[str, int]
+    dominating: str
+
+
+class SyncMessage(Wire):
+    """How well the two images are proved to show one instant."""
+
+    skew_us: float
+    sigma_us: float
+    proof: str
+    resends: int
+    missing: int
+
+
+class RecipeMessage(Wire):
+    """The recipe a cycle worked by."""
+
+    number: int
+    name: str
+    sha256: str
+
+
+class Inputs(Wire):
+    """What the result rests on."""
+
+    rig_sha256: str
+    settings_sha256: str
+    recipe: RecipeMessage
+    frame_ids: tuple[int, int]
+
+
+class Result(Wire):
+    """The whole answer of a cycle."""
+
+    schema_: Annotated[Literal["binpick-result/1"], Field(alias="schema")] = "binpick-result/1"
+    cycle_id: int
+    request: Request
+    captured_at: str | None
+    age_ms: float | None = None
+    simulated: bool = False
+    preview: bool = False
+    return_code: ReturnCode
+    bin: BinMessage | None
+    grasps: tuple[GraspMessage, ...] = ()
+    funnel: Funnel | None = None
+    sync: SyncMessage | None = None
+    timing_ms: dict[str, float] = {}
+    inputs: Inputs | None = None
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+    def json_bytes(self) -> bytes:
+        """The result as every interface and file carries it."""
+        return self.model_dump_json(by_alias=True, indent=1).encode() + b"\n"
+
+    def timeless_bytes(self) -> bytes:
+        """Without times and ages: equal bytes mean an equal answer."""
+        return self.model_copy(update={"timing_ms": {}, "age_ms": None, "captured_at": None}).json_bytes()
+
+
+@functools.cache
+def failure_bin(number: int) -> BinMessage:
+    """The bin entry of a cycle that never got to look for it."""
+    return BinMessage(found=False, number=number, T_camera_bin=None, fill_level=None, coverage=None)
+
+
+def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, simulated: bool = False) -> Result:
+    """The result of a cycle that never came to its scene."""
+    return Result(cycle_id=cycle_id, request=request, captured_at=None, simulated=simulated,
+                  return_code=ReturnCode.of(code, message), bin=None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleInput:
+    """Everything that one cycle reads; stored together with its result it is a recording."""
+
+    cycle_id: int
+    pair: StereoPair
+    rig: Rig
+    job: Job
+    request: Request
+    simulated: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleResult:
+    """The answer, and what people want to see of how it came about (None from the stage on that was not reached)."""
+
+    result: Result
+    rectified: Rectified | None = None
+    depth: Depth | None = None
+    cloud: OrganisedCloud | None = None
+    segments: Segments | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A finished cycle as it is published: the object, its bytes, and when (monotonic ns) its images were triggered."""
+
+    result: Result
+    body: bytes
+    triggered_ns: int
+    finished_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Everything the interfaces may show, at one instant; replaced whole, never changed.
+
+    `phase` is one of starting, ready, acquiring, computing, stopping. `current` is the cycle in flight (0: none);
+    `published` is the result that holds until it is acknowledged, withdrawn, too old, or replaced: `valid` says whether it
+    does, `withdrawn` why not. `latest` is the last finished cycle whatever became of it.
+    """
+
+    boot_id: int
+    phase: Literal["starting", "ready", "acquiring", "computing", "stopping"] = "starting"
+    current: int = 0
+    request: Request | None = None
+    acquired: bool = False
+    published: Published | None = None
+    valid: bool = False
+    withdrawn: str = ""
+    latest: Published | None = None
+    cameras: tuple[CameraStatus, ...] = ()
+    faults: tuple[str, ...] = ()
+    owner: Literal["modbus", "rest", "none"] = "none"
+    simulated: bool = False
+    counts: tuple[tuple[str, int], ...] = ()

@@ -1,0 +1,1 @@
+"""The bin, its height map, and the parts in it."""

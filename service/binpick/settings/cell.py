@@ -1,0 +1,144 @@
+"""The whole cell: bins, tools, recipes, cameras, who controls it, where it publishes."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from binpick.settings.base import Strict
+from binpick.settings.recipe import Bin, Recipe
+from binpick.settings.tool import Tool
+
+Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+class CameraAddress(Strict):
+    """One GigE Vision camera."""
+
+    address: str = ""
+    """IPv4 address; opened without discovery."""
+    serial: str = ""
+    """Serial number, checked when given, searched when there is no address."""
+
+
+class AravisCameras(Strict):
+    """Two GigE Vision cameras driven by Aravis."""
+
+    backend: Literal["aravis"] = "aravis"
+    left: CameraAddress = CameraAddress(address="169.254.1.2")
+    """The rig's first camera."""
+    right: CameraAddress = CameraAddress(address="169.254.2.2")
+    """The rig's second camera."""
+    sync: Literal["software"] = "software"
+    """How the two are triggered: one software trigger each, 0.1 to 0.5 ms apart."""
+    max_skew_us: Annotated[float, Field(gt=0, le=1_000_000)] = 5000.0
+    """A pair exposed further apart is refused, µs."""
+    packet_size: Annotated[int, Field(ge=576, le=16000)] = 1500
+    """GVSP packet size with its IP header, bytes; not above the network's MTU."""
+    heartbeat_ms: Annotated[int, Field(ge=1500, le=60000)] = 3000
+    """After this silence a camera frees itself of its controller, ms."""
+
+
+class FileCameras(Strict):
+    """Images from disk instead of cameras: every cycle sees the same pair."""
+
+    backend: Literal["files"]
+    left: Path
+    """The left image."""
+    right: Path
+    """The right image."""
+    max_skew_us: Annotated[float, Field(gt=0, le=1_000_000)] = 5000.0
+    """Kept for symmetry; files have no skew."""
+
+
+class RestSettings(Strict):
+    """The REST server and the page at /ui."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 for all."""
+    port: Port = 8080
+    """TCP port."""
+
+
+class ModbusSettings(Strict):
+    """The Modbus/TCP server."""
+
+    host: str = "0.0.0.0"
+    """Address to listen on."""
+    port: Port = 502
+    """TCP port."""
+    word_order: Literal["ABCD", "CDAB"] = "ABCD"
+    """Order of the two words of a 32-bit value."""
+
+
+class Publish(Strict):
+    """Where results go."""
+
+    rest: RestSettings = RestSettings()
+    """REST."""
+    modbus: ModbusSettings | None = ModbusSettings()
+    """Modbus/TCP; null: none."""
+
+
+class Recording(Strict):
+    """Keeps cycles on disk."""
+
+    directory: Path | None = None
+    """Every cycle's input and result are stored below this folder; null: none."""
+
+
+class Cell(Strict):
+    """One robot cell. Only `bins` (or `bin`) is required."""
+
+    bins: Annotated[tuple[Bin, ...], Field(min_length=1)]
+    """The load carriers."""
+    tools: Annotated[tuple[Tool, ...], Field(min_length=1)] = (Tool(),)
+    """The tools; also `gripper:` for a single one."""
+    recipes: Annotated[tuple[Recipe, ...], Field(min_length=1)] = (Recipe(),)
+    """The recipes; the first is the default."""
+    rig: Path = Path("rig.json")
+    """The rig file, relative to the cell file."""
+    cameras: Annotated[AravisCameras | FileCameras, Field(discriminator="backend")] = AravisCameras()
+    """The cameras."""
+    control: Literal["modbus", "rest", "none"] = "modbus"
+    """The one interface that may start cycles."""
+    publish: Publish = Publish()
+    """Servers."""
+    recording: Recording = Recording()
+    """What is kept."""
+    timeout_ms: Annotated[int, Field(ge=100, le=60000)] = 5000
+    """Time limit of a cycle when the request names none, ms."""
+    result_max_age_ms: Annotated[int, Field(ge=500, le=3_600_000)] = 60000
+    """A result unread for longer than this is withdrawn, ms."""
+    reconnect_s: Annotated[float, Field(ge=0.1, le=60)] = 2.0
+    """A controller's connection lost for longer than this withdraws its result, seconds."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _singles(cls, document: Any) -> Any:
+        """A single `bin:` or `gripper:` is number 1."""
+        if not isinstance(document, dict):
+            return document
+        document = dict(document)
+        for single, several in (("bin", "bins"), ("gripper", "tools")):
+            if single in document:
+                if several in document:
+                    raise ValueError(f"give {single} or {several}, not both")
+                document[several] = [document.pop(single)]
+        return document
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Cell":
+        for kind in ("bins", "tools", "recipes"):
+            numbers = [item.number for item in getattr(self, kind)]
+            if len(set(numbers)) != len(numbers):
+                raise ValueError(f"{kind}: every number may stand once, got {numbers}")
+        bins, tools = {b.number for b in self.bins}, {t.number for t in self.tools}
+        for recipe in self.recipes:
+            if recipe.bin is not None and recipe.bin not in bins:
+                raise ValueError(f"recipe {recipe.number}: there is no bin {recipe.bin}")
+            if missing := set(recipe.tools) - tools:
+                raise ValueError(f"recipe {recipe.number}: there is no tool {sorted(missing)}")
+        if self.control == "modbus" and self.publish.modbus is None:
+            raise ValueError("control is modbus, but publish.modbus is null")
+        return self

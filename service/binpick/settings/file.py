@@ -1,0 +1,85 @@
+"""Reads a cell file; an error names file, line, key and what is allowed."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from binpick.errors import SettingsError
+from binpick.settings.cell import Cell
+
+
+def load(path: Path) -> Cell:
+    """The cell of a file, relative paths resolved against the file's folder. Raises SettingsError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: the cell file cannot be read: {getattr(error, 'strerror', error)}") from error
+    cell = parse(text, str(path))
+    changes: dict[str, Any] = {"rig": path.parent / cell.rig}
+    if cell.cameras.backend == "files":
+        changes["cameras"] = cell.cameras.model_copy(
+            update={"left": path.parent / cell.cameras.left, "right": path.parent / cell.cameras.right})
+    return cell.model_copy(update=changes)
+
+
+def parse(text: str, name: str) -> Cell:
+    """The cell of a YAML text; `name` stands in error messages. Raises SettingsError."""
+    try:
+        document = yaml.safe_load(text)
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{name}:{mark.line + 1}" if mark else name
+        raise SettingsError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
+    if not isinstance(document, dict):
+        raise SettingsError(f"{name}: a cell file is a mapping with at least `bin:`; see deploy/cell.yaml")
+    try:
+        return Cell.model_validate(document)
+    except ValidationError as error:
+        found = error.errors()
+        # a list whose item is wrong is also reported as too short: say the cause only
+        causes = [e for e in found if e["type"] != "too_short" or not any(o["loc"][:len(e["loc"])] == e["loc"] != o["loc"]
+                                                                          for o in found)]
+        raise SettingsError("; ".join(_say(name, tree, item) for item in causes[:3])) from error
+
+
+def _say(name: str, tree: yaml.Node | None, item: Any) -> str:
+    loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder")]
+    key = ".".join(str(part) for part in loc)
+    message = "unknown key" if item["type"] == "extra_forbidden" else str(item["msg"])
+    given = f" (it is {item['input']!r})" if isinstance(item.get("input"), int | float | str) else ""
+    return f"{name}:{_line(tree, loc)}: {key + ': ' if key else ''}{message}{given}"
+
+
+def _line(node: yaml.Node | None, loc: list[Any]) -> int:
+    """The line of the deepest node of `loc` that the file has; `bins.0` is also a single `bin`."""
+    line = node.start_mark.line + 1 if node is not None else 1
+    while loc and node is not None:
+        head, loc = loc[0], loc[1:]
+        child: yaml.Node | None = None
+        if isinstance(node, yaml.MappingNode):
+            singles = {"bins": "bin", "tools": "gripper"}
+            for key, value in node.value:
+                if key.value == str(head):
+                    line, child = key.start_mark.line + 1, value
+                elif key.value == singles.get(str(head)):
+                    line, child, loc = key.start_mark.line + 1, value, loc[1:]
+        elif isinstance(node, yaml.SequenceNode) and isinstance(head, int) and head < len(node.value):
+            child = node.value[head]
+            line = child.start_mark.line + 1
+        node = child
+    return line
+
+
+def schema() -> str:
+    """The cell file's JSON schema, as `binpick schema` prints it."""
+    return json.dumps(Cell.model_json_schema(), indent=1) + "\n"
+
+
+def digest(cell: Cell) -> str:
+    """Names a whole cell file in a result."""
+    return hashlib.sha256(cell.model_dump_json().encode()).hexdigest()

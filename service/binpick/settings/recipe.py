@@ -1,0 +1,140 @@
+"""A bin and a recipe: what stands where, and how a cycle looks for parts in it."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from binpick.geometry import Transform
+from binpick.settings.base import Number, Placement, Position, Strict
+
+Length = Annotated[float, Field(ge=0.02, le=3)]
+
+
+class Pose(Placement):
+    """Where the bin stands."""
+
+    frame: Literal["camera", "base"] = "camera"
+    """The frame the position and orientation are given in."""
+
+
+class Bin(Strict):
+    """A load carrier: open box, origin at the centre of the inner floor, x along its length, z up."""
+
+    number: Number = 1
+    name: Annotated[str, Field(min_length=1, max_length=64)] = "bin"
+    """For people."""
+    inner_size_m: tuple[Length, Length, Length]
+    """Inside length, width and height, metres."""
+    wall_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.003
+    """Wall thickness, metres."""
+    pose: Pose
+    """Where it stands."""
+
+    @property
+    def T_parent_bin(self) -> Transform:
+        """Maps bin coordinates to those of `pose.frame`."""
+        return self.pose.T_parent_this
+
+
+class PartSize(Strict):
+    """The parts' size, as the longest edge of what is seen of one."""
+
+    min_size_m: Annotated[float, Field(ge=0.002, le=1)] = 0.012
+    """Faces with a longer side below this are not offered, metres."""
+    max_size_m: Annotated[float, Field(ge=0.005, le=2)] = 0.12
+    """Segments longer than this are taken for several parts grown together, metres."""
+
+
+class StereoSettings(Strict):
+    """How disparity is found; the bin gives window and range."""
+
+    block_px: Annotated[int, Field(ge=1, le=11)] = 5
+    """Side of the matched block, odd, px."""
+    p1: Annotated[int, Field(ge=1, le=20000)] = 200
+    """Penalty for a disparity step of 1 px between neighbours."""
+    p2: Annotated[int, Field(ge=2, le=40000)] = 800
+    """Penalty for a larger step; above p1."""
+    uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 5
+    """How much better the best match must be than the second best."""
+    wls_lambda: Annotated[float, Field(ge=1, le=100000)] = 8000.0
+    """Smoothness of the filled map."""
+    wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
+    """How strongly the filled map respects edges of the image."""
+    min_confidence: Annotated[int, Field(ge=0, le=255)] = 128
+    """WLS confidence from which a pixel counts as measured."""
+    edge_px: Annotated[int, Field(ge=0, le=10)] = 2
+    """Pixels next to a depth jump that do not count as measured: a matched block straddles the edge there."""
+    speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
+    """Islands of fewer pixels do not count as measured."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "StereoSettings":
+        if self.block_px % 2 == 0:
+            raise ValueError("block_px must be odd")
+        if self.p2 <= self.p1:
+            raise ValueError("p2 must be larger than p1")
+        return self
+
+
+class SegmentSettings(Strict):
+    """How parts are told apart."""
+
+    method: Literal["grid", "open3d"] = "grid"
+    """grid: jumps and creases on the pixel grid; open3d: voxels, normals and DBSCAN on the unorganised cloud."""
+    crease_rad: Annotated[float, Field(ge=0.05, le=1.5)] = 0.38
+    """Angle between neighbouring normals that ends a face, radians."""
+    jump_m: Annotated[float, Field(ge=0.0005, le=0.05)] = 0.0035
+    """Step off the tangent plane that ends a part, metres."""
+
+
+class Reach(Strict):
+    """The box the TCP may be sent to, in frame `base` where the rig knows it, else `camera`."""
+
+    min_m: Position = (-10.0, -10.0, -10.0)
+    """Lowest corner, metres."""
+    max_m: Position = (10.0, 10.0, 10.0)
+    """Highest corner, metres."""
+
+
+class Limits(Strict):
+    """What is never published."""
+
+    margin_m: Annotated[float, Field(ge=0, le=0.05)] = 0.002
+    """Clearance kept between tool and everything else, metres."""
+    above_rim_m: Annotated[float, Field(ge=0, le=0.5)] = 0.04
+    """How far above the rim parts are looked for, metres."""
+    reach: Reach = Reach()
+    """Where the robot can go."""
+
+
+class Recipe(Strict):
+    """How one kind of part is picked; recipe 0 on the wire is the first one."""
+
+    number: Number = 1
+    name: Annotated[str, Field(min_length=1, max_length=64)] = "default"
+    """For people."""
+    bin: Number | None = None
+    """Bin to pick from; the first one when absent."""
+    tools: tuple[Number, ...] = ()
+    """Tools to pick with; the first one when empty."""
+    part: PartSize = PartSize()
+    """What the parts are like."""
+    stereo: StereoSettings = StereoSettings()
+    """Matching."""
+    segment: SegmentSettings = SegmentSettings()
+    """Telling parts apart."""
+    exposure_us: Annotated[float, Field(ge=20, le=500_000)] = 6000.0
+    """Exposure time of both cameras, µs."""
+    gain_db: Annotated[float, Field(ge=0, le=24)] = 0.0
+    """Gain of both cameras, dB."""
+    projector: bool = True
+    """Whether the pattern is on during exposure."""
+    limits: Limits = Limits()
+    """What is never published."""
+    max_grasps: Annotated[int, Field(ge=1, le=20)] = 5
+    """Most grasps in a result."""
+    frame: Literal["camera", "bin", "base"] = "base"
+    """Frame of published poses when the request names none."""
+    pose_format: Literal["quaternion_xyzw", "rotvec_rad", "kuka_abc_deg", "fanuc_wpr_deg", "ur_rxryrz_rad"] = (
+        "quaternion_xyzw")
+    """Orientation on Modbus when the request names none."""

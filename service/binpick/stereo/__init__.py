@@ -1,0 +1,1 @@
+"""Rectified pair to measured disparity to organised cloud."""

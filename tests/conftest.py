@@ -1,0 +1,50 @@
+"""Every test: no leaked threads, free ports, a time limit."""
+
+import faulthandler
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+LIMIT_S = 60
+SLOW_LIMIT_S = 300
+faulthandler.enable()
+
+
+@pytest.fixture(autouse=True)
+def time_limit(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test that hangs fails with a traceback instead of stopping the run."""
+    limit = SLOW_LIMIT_S if request.node.get_closest_marker("slow") else LIMIT_S
+
+    def expire(_signum: int, _frame: object) -> None:
+        faulthandler.dump_traceback()
+        raise TimeoutError(f"test took longer than {limit} s")
+
+    previous = signal.signal(signal.SIGALRM, expire)
+    signal.alarm(limit)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
+@pytest.fixture(autouse=True)
+def no_leaked_threads(time_limit: None) -> Iterator[None]:
+    """Every thread of ours that a test starts is gone when it ends."""
+    before = set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + 3
+    while leaked := [t for t in threading.enumerate() if t not in before and t.name.startswith("binpick")]:
+        if time.monotonic() > deadline:
+            pytest.fail(f"leaked threads: {[t.name for t in leaked]}")
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def free_port() -> int:
+    """A TCP port of 127.0.0.1 that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
