@@ -76,6 +76,7 @@ class CameraStatus:
     failures: int = 0
     resends: int = 0
     error: str = ""
+    simulated: bool = False
 
 
 @dataclass(frozen=True, slots=True)
