@@ -97,7 +97,7 @@ class Rectified:
 
     Both images carry `margin` more columns on the left than the window, so that every window pixel has its whole search
     range. `focal_px`, `baseline_m` and the principal point belong to the rectified left view, its pixel (0, 0) being the
-    whole view's; R_rect_camera turns camera directions into rect ones.
+    whole view's; T_camera_rect turns rect directions into the camera frame.
     """
 
     left: Image
