@@ -4,7 +4,7 @@ import asyncio
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from binpick.result import Request, Result, Snapshot
+from binpick.result import Published, Request, Result, Snapshot
 
 Source = Literal["modbus", "rest"]
 
@@ -34,6 +34,10 @@ class View(Protocol):
 
     def result(self, cycle_id: int) -> Result | None:
         """A finished cycle still in memory (the last 16), or None."""
+        ...
+
+    def finished(self, cycle_id: int) -> Published | None:
+        """The same with its bytes and the instant of its trigger, from which its age is told."""
         ...
 
     def artefact(self, cycle_id: int, name: str) -> Artefact | None:
