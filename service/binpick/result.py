@@ -234,6 +234,14 @@ class Published:
 
 
 @dataclass(frozen=True, slots=True)
+class Artefact:
+    """A picture or a cloud of a finished cycle."""
+
+    media_type: str
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """Everything the interfaces may show, at one instant; replaced whole, never changed.
 

@@ -1,20 +1,13 @@
 """All that a publisher knows of the cell: what it may read, and what it may ask for."""
 
 import asyncio
-from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from binpick.result import Published, Request, Result, Snapshot
+from binpick.result import Artefact, Published, Request, Result, Snapshot
+
+__all__ = ["Artefact", "Control", "Source", "View"]
 
 Source = Literal["modbus", "rest"]
-
-
-@dataclass(frozen=True, slots=True)
-class Artefact:
-    """A picture or a cloud of a finished cycle."""
-
-    media_type: str
-    body: bytes
 
 
 class View(Protocol):

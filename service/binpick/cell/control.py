@@ -1,0 +1,152 @@
+"""The cell as its interfaces know it: everything they may read, and everything they may ask for."""
+
+import asyncio
+import contextlib
+import logging
+import time
+from types import TracebackType
+
+from binpick import pipeline, settings
+from binpick.camera.base import Clock
+from binpick.cell import machine, worker
+from binpick.cell.board import Board
+from binpick.cell.gallery import Gallery
+from binpick.cell.worker import Cameras, Run, Worker
+from binpick.errors import CycleRefused, NotInControl
+from binpick.recording import Recorder
+from binpick.result import Artefact, Published, Request, Result, Snapshot
+from binpick.rig import Rig
+
+STOP_LIMIT_S = 2.0
+"""How long the running step may take to end before its thread is abandoned."""
+
+log = logging.getLogger(__name__)
+
+
+class Cell:
+    """Implements publish.ports.View and Control. Nothing here blocks but `artefact`.
+
+    Live inside `async with cell:`, or from `launch` to `close`: a worker thread computes, and a task of the running loop
+    enforces deadlines, so that a worker stuck in a driver delays no answer.
+    """
+
+    def __init__(self, cell: settings.Cell, rig: Rig, cameras: Cameras, run: Run = pipeline.run, *, boot_id: int,
+                 recorder: Recorder | None = None, clock: Clock = time.monotonic_ns) -> None:
+        self._settings, self._rig, self._clock = cell, rig, clock
+        self._board = Board(machine.State(max_age_ns=cell.result_max_age_ms * 1_000_000), boot_id, cell.control)
+        self._gallery = Gallery()
+        self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, recorder, clock))
+        self._supervisor: asyncio.Task[None] | None = None
+
+    def snapshot(self) -> Snapshot:
+        """The one immutable state all interfaces show."""
+        return self._board.snapshot
+
+    def subscribe(self) -> asyncio.Event:
+        """An event of the running loop, set at every new snapshot."""
+        return self._board.subscribe()
+
+    def unsubscribe(self, event: asyncio.Event) -> None:
+        """Ends a subscription."""
+        self._board.unsubscribe(event)
+
+    def result(self, cycle_id: int) -> Result | None:
+        """A finished cycle still in memory, or None."""
+        kept = self.finished(cycle_id)
+        return kept.result if kept else None
+
+    def finished(self, cycle_id: int) -> Published | None:
+        """The same with its bytes and the instant of its trigger."""
+        return machine.find(self._board.state, cycle_id)
+
+    def artefact(self, cycle_id: int, name: str) -> Artefact | None:
+        """A picture or the cloud of the last cycle; takes tens of milliseconds."""
+        return self._gallery.artefact(cycle_id, name)
+
+    def start(self, request: Request, source: machine.Source) -> int:
+        """Starts a cycle and returns its id at once.
+
+        Raises NotInControl, NotReady, Busy, UnknownItem, FrameUnavailable, FlangePoseMissing; nothing has changed then.
+        """
+        try:
+            self._admit(source)
+            job = settings.resolve(self._settings, request.recipe, request.bin, request.tool)
+            pipeline.admit(self._rig, job, request)
+            timeout_ns = (request.timeout_ms or self._settings.timeout_ms) * 1_000_000
+            return self._board.step(machine.start, request, job, self._clock(), timeout_ns).last_id
+        except CycleRefused:
+            self._board.step(machine.refused)
+            raise
+
+    def abort(self, cycle_id: int, source: machine.Source) -> None:
+        """Retires a running cycle (−26)."""
+        self._admit(source)
+        self._board.step(machine.abort, cycle_id, self._clock())
+
+    def acknowledge(self, cycle_id: int, source: machine.Source) -> None:
+        """The controller has read the published result."""
+        self._admit(source)
+        self._board.step(machine.acknowledge, cycle_id)
+
+    def withdraw(self, reason: str, source: machine.Source) -> None:
+        """Takes back what is published or running."""
+        self._admit(source)
+        self._board.step(machine.withdraw, reason, self._clock())
+
+    def report(self, cycle_id: int, grasp: int, outcome: int, source: machine.Source) -> None:
+        """What became of a grasp."""
+        self._admit(source)
+        self._board.step(machine.report, cycle_id, grasp, outcome)
+        log.info("cycle %d grasp %d: outcome %d by %s", cycle_id, grasp, outcome, source)
+
+    def launch(self) -> None:
+        """Starts the worker thread, and the supervisor on the running loop."""
+        self._supervisor = asyncio.get_running_loop().create_task(self._supervise(), name="binpick-supervisor")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """READY falls, triggers are refused, what runs or holds is withdrawn; returns at once."""
+        self._board.step(machine.stop, self._clock())
+
+    async def close(self, limit_s: float = STOP_LIMIT_S) -> bool:
+        """Stops and waits for the worker to give the cameras back. False: it did not within the limit and is abandoned."""
+        self.stop()
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + limit_s
+        while self._thread.is_alive() and loop.time() < deadline:
+            await asyncio.sleep(0.005)
+        if self._supervisor is not None:
+            self._supervisor.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._supervisor
+        if self._thread.is_alive():
+            log.warning("the cell's thread did not end within %.1f s and is abandoned", limit_s)
+        return not self._thread.is_alive()
+
+    async def __aenter__(self) -> "Cell":
+        self.launch()
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                        traceback: TracebackType | None) -> None:
+        await self.close()
+
+    def _admit(self, source: machine.Source) -> None:
+        owner = self._settings.control
+        if source != owner:
+            raise NotInControl(f"this cell is controlled by {owner}, not by {source}: "
+                               "see `control` in the cell file")
+
+    async def _supervise(self) -> None:
+        """Wakes at every change and at the next instant that matters; the worker may be stuck, this is not."""
+        changed = self.subscribe()
+        try:
+            while True:
+                changed.clear()
+                now_ns = self._clock()
+                due_ns = machine.due(self._board.step(machine.tick, now_ns))
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(None if due_ns is None else (due_ns - now_ns) / 1e9):
+                        await changed.wait()
+        finally:
+            self.unsubscribe(changed)

@@ -1,0 +1,175 @@
+"""The thread that owns the cameras and computes cycles; whatever happens in one, it is there for the next."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from binpick.camera.base import Clock, MonotonicNs
+from binpick.cell import machine
+from binpick.cell.board import Board
+from binpick.cell.gallery import Gallery
+from binpick.cell.machine import State, Ticket
+from binpick.data import CameraStatus, Light, StereoPair
+from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout
+from binpick.recording import Recorder
+from binpick.result import CycleInput, CycleResult, Published, Result, failure
+from binpick.rig import Rig
+
+OPEN_LIMIT_S = 10.0
+"""For opening all cameras; a camera whose link just came up answers only after seconds."""
+BACKOFF_S = (0.5, 1.0, 2.0, 5.0)
+"""Waits between attempts to open the cameras."""
+WATCH_S = 0.5
+"""How often an idle cell looks at what its cameras say."""
+INTERNAL_ERROR = "internal error, see the log"
+
+log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class Cameras(Protocol):
+    """The rig's cameras as one."""
+
+    def open(self, deadline_ns: MonotonicNs) -> None:
+        """Opens those that are not open; raises one CameraError that names every broken one."""
+        ...
+
+    def capture(self, light: Light, deadline_ns: MonotonicNs) -> StereoPair:
+        """Triggers all and returns their accepted pair; raises CameraError."""
+        ...
+
+    def close(self) -> None:
+        """Gives them back; never raises."""
+        ...
+
+    def statuses(self) -> tuple[CameraStatus, ...]:
+        """What each says of itself, without waiting."""
+        ...
+
+
+Run = Callable[[CycleInput, Callable[[], None]], CycleResult]
+
+
+@dataclass(frozen=True, slots=True)
+class Worker:
+    """What the thread needs; `run` is the pipeline."""
+
+    board: Board
+    gallery: Gallery
+    cameras: Cameras
+    rig: Rig
+    run: Run
+    recorder: Recorder | None
+    clock: Clock
+
+    def live(self) -> None:
+        """The thread's body: opens cameras, waits for tickets, until the cell stops."""
+        attempts = 0
+        try:
+            self.board.step(machine.observe, self.cameras.statuses())
+            while not self.board.state.stopping:
+                attempts = self._turn(attempts)
+        finally:
+            self.cameras.close()
+
+    def _turn(self, attempts: int) -> int:
+        """One ticket, one attempt to open the cameras, or one look at them. Returns the failed attempts in a row."""
+        pause = WATCH_S if self.board.state.cameras_up else ((0.0, *BACKOFF_S)[min(attempts, len(BACKOFF_S))])
+        state = self.board.wait(_wanted, pause)
+        try:
+            if state.stopping:
+                return attempts
+            if state.ticket is not None:
+                self._cycle(state.ticket)
+            elif not state.cameras_up:
+                attempts += 1
+                self.cameras.open(self.clock() + int(OPEN_LIMIT_S * 1e9))
+                log.info("cameras open: %s", ", ".join(f"{c.name} {c.model} {c.serial}" for c in self.cameras.statuses()))
+        except CameraError as error:
+            log.warning("cameras not open: %s", error)
+        except Exception:
+            log.exception("unexpected, outside a cycle")
+            self.board.step(machine.stumble, INTERNAL_ERROR)
+            time.sleep(WATCH_S)
+        self.board.step(machine.observe, self.cameras.statuses())
+        return 0 if self.board.state.cameras_up else attempts
+
+    def _cycle(self, ticket: Ticket) -> None:
+        fault, inputs = "", None
+        try:
+            inputs = self._acquire(ticket)
+            result = self._compute(ticket, inputs)
+        except CycleAborted:
+            self.board.step(machine.finish, ticket.cycle_id, None)
+            return
+        except BinpickError as error:
+            result = self._failure(ticket, error.code, str(error))
+        except Exception:
+            log.exception("cycle %d: unexpected", ticket.cycle_id)
+            fault = INTERNAL_ERROR
+            result = self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR)
+        finished_ns = self.clock()
+        triggered_ns = _triggered_ns(inputs.pair) if inputs else finished_ns
+        published = Published(result, result.json_bytes(), triggered_ns, finished_ns)
+        # cameras first: who sees the result and triggers again must not be told READY by cameras that just died
+        self.board.step(machine.observe, self.cameras.statuses())
+        state = self.board.step(machine.finish, ticket.cycle_id, published, fault)
+        if machine.find(state, ticket.cycle_id) is not published:
+            log.warning("cycle %d: its late result was dropped", ticket.cycle_id)
+            return
+        log.info("cycle %d: %d %s, %d grasps, %.0f ms", ticket.cycle_id, result.return_code.value, result.return_code.name,
+                 len(result.grasps), (finished_ns - ticket.started_ns) / 1e6)
+        if self.recorder is not None and inputs is not None:
+            self.recorder.offer(inputs, result)
+
+    def _acquire(self, ticket: Ticket) -> CycleInput:
+        recipe = ticket.job.recipe
+        self._proceed(ticket)
+        pair = self.cameras.capture(Light(recipe.exposure_us, recipe.gain_db, recipe.projector), ticket.deadline_ns)
+        simulated = any(status.simulated for status in self.cameras.statuses())
+        self.board.step(machine.acquired, ticket.cycle_id)
+        return CycleInput(ticket.cycle_id, pair, self.rig, ticket.job, ticket.request, simulated)
+
+    def _compute(self, ticket: Ticket, inputs: CycleInput) -> Result:
+        """The pipeline's result with the cell's own times; its arrays go to the gallery while the id still counts."""
+        acquired_ns = self.clock()
+        cycle = CycleResult(self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR))
+        try:
+            self._proceed(ticket)
+            cycle = self.run(inputs, lambda: self._proceed(ticket))
+        finally:
+            if self._counts(ticket):
+                self.gallery.keep(cycle, inputs.pair)
+        times = {"acquire": (acquired_ns - ticket.started_ns) / 1e6, **cycle.result.timing_ms,
+                 "total": (self.clock() - ticket.started_ns) / 1e6}
+        return cycle.result.model_copy(update={"timing_ms": {name: round(ms, 3) for name, ms in times.items()}})
+
+    def _proceed(self, ticket: Ticket) -> None:
+        """Called between stages: a retired cycle ends at the next step, one out of time says so."""
+        if not self._counts(ticket):
+            raise CycleAborted(f"cycle {ticket.cycle_id} was retired")
+        if self.clock() >= ticket.deadline_ns:
+            raise CycleTimeout(Code.TIMEOUT.message)
+
+    def _counts(self, ticket: Ticket) -> bool:
+        running = self.board.state.running
+        return running is not None and running.cycle_id == ticket.cycle_id
+
+    def _failure(self, ticket: Ticket, code: Code, message: str) -> Result:
+        return failure(ticket.cycle_id, ticket.request, code, message, simulated=self.board.state.simulated)
+
+
+def thread(worker: Worker) -> threading.Thread:
+    """The thread, not yet started. A daemon: a camera driver stuck in C must not hold the program's exit."""
+    return threading.Thread(target=worker.live, name="binpick-cell", daemon=True)
+
+
+def _wanted(state: State) -> bool:
+    return state.stopping or state.ticket is not None
+
+
+def _triggered_ns(pair: StereoPair) -> MonotonicNs:
+    return min(pair.left.triggered_ns, pair.right.triggered_ns)

@@ -1,0 +1,364 @@
+"""The living cell: a worker thread, a supervisor on the loop, and cameras that do what the test says."""
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from binpick import settings
+from binpick.cell import Cell
+from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
+from binpick.errors import (
+    Busy,
+    CameraLost,
+    Code,
+    FrameUnavailable,
+    InputError,
+    NotApplicable,
+    NotInControl,
+    NotReady,
+    UnknownItem,
+)
+from binpick.result import CycleInput, CycleResult, Request, Result, ReturnCode, Snapshot
+from binpick.rig import Rig
+from binpick.settings import Bin, Pose, Recipe
+
+K = ((100.0, 0.0, 16.0), (0.0, 100.0, 12.0), (0.0, 0.0, 1.0))
+EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+RIGHT = ((1.0, 0.0, 0.0, -0.15), *EYE[1:])
+
+
+def rig() -> Rig:
+    return Rig.model_validate({
+        "image_size_px": (32, 24),
+        "cameras": [{"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
+                    for name, T in (("left", EYE), ("right", RIGHT))]})
+
+
+def cell_settings(**changes: object) -> settings.Cell:
+    return settings.Cell.model_validate({
+        "bins": [Bin(inner_size_m=(0.6, 0.4, 0.18), pose=Pose(position_m=(0, 0, 1)))], "recipes": [Recipe(frame="camera")],
+        "control": "rest", **changes})
+
+
+def pair(triggered_ns: int, light: Light) -> StereoPair:
+    frames = [Frame(frozen(np.zeros((24, 32), np.uint8)), name, 1, 1, triggered_ns, triggered_ns, triggered_ns,
+                    light.exposure_us, light.gain_db) for name in ("left", "right")]
+    return StereoPair(frames[0], frames[1], "2026-01-02T03:04:05.678Z", 0.0, 0.0, "simulated")
+
+
+@dataclass
+class TestCameras:
+    """Cameras of the test: `gate` holds a capture, `broken` names the camera that is dead."""
+
+    __test__ = False
+    broken: str = ""
+    opened: bool = False
+    captures: list[Light] = field(default_factory=list)
+    attempts: int = 0
+    closed: int = 0
+    gate: threading.Event = field(default_factory=threading.Event)
+
+    def open(self, deadline_ns: int) -> None:
+        self.attempts += 1
+        if self.broken:
+            raise CameraLost(f"camera {self.broken} is dead", self.broken)
+        self.opened = True
+
+    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
+        self.captures.append(light)
+        triggered_ns = time.monotonic_ns()
+        self.gate.wait()
+        if self.broken:
+            self.opened = False
+            raise CameraLost(f"camera {self.broken} is dead", self.broken)
+        return pair(triggered_ns, light)
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def statuses(self) -> tuple[CameraStatus, ...]:
+        return tuple(CameraStatus(name, self.opened, simulated=True, error="dead" if self.broken == name else "")
+                     for name in ("left", "right"))
+
+
+def good(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+    proceed()
+    return CycleResult(Result(cycle_id=inputs.cycle_id, request=inputs.request, captured_at=inputs.pair.captured_at,
+                              simulated=inputs.simulated, return_code=ReturnCode.of(Code.BIN_EMPTY), bin=None,
+                              timing_ms={"match": 1.0}))
+
+
+@asynccontextmanager
+async def living(cameras: TestCameras, run: Callable[[CycleInput, Callable[[], None]], CycleResult] = good,
+                 ready: bool = True, **changes: object) -> AsyncIterator[Cell]:
+    cell = Cell(cell_settings(**changes), rig(), cameras, run, boot_id=7)
+    async with cell:
+        if ready:
+            await until(cell, lambda s: s.phase == "ready")
+        try:
+            yield cell
+        finally:
+            cameras.gate.set()
+
+
+async def until(cell: Cell, condition: Callable[[Snapshot], bool], limit_s: float = 5.0) -> Snapshot:
+    changed = cell.subscribe()
+    try:
+        async with asyncio.timeout(limit_s):
+            while not condition(cell.snapshot()):
+                changed.clear()
+                if condition(cell.snapshot()):
+                    break
+                await changed.wait()
+    finally:
+        cell.unsubscribe(changed)
+    return cell.snapshot()
+
+
+def released() -> TestCameras:
+    cameras = TestCameras()
+    cameras.gate.set()
+    return cameras
+
+
+def test_a_cycle_is_captured_computed_and_published() -> None:
+    async def scenario() -> None:
+        cameras = released()
+        async with living(cameras) as cell:
+            cycle_id = cell.start(Request(request_id="mine"), "rest")
+            assert cell.snapshot().current == cycle_id == 1
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.phase == "ready"
+            assert shown.published is not None
+            result = shown.published.result
+            assert (result.cycle_id, result.request.request_id, result.return_code.code) == (1, "mine", Code.BIN_EMPTY)
+            assert list(result.timing_ms) == ["acquire", "match", "total"]
+            assert result.simulated
+            assert shown.published.body == result.json_bytes()
+            assert cell.result(1) is result
+            assert cell.finished(1) is shown.published
+            assert cameras.captures[0].exposure_us == 6000.0
+            cell.acknowledge(1, "rest")
+            assert (cell.snapshot().valid, cell.snapshot().withdrawn) == (False, "acknowledged")
+            cell.start(Request(), "rest")
+            assert (await until(cell, lambda s: s.valid)).latest is cell.finished(2)
+        assert cameras.closed == 1
+
+    asyncio.run(scenario())
+
+
+def test_a_busy_cell_refuses_at_once_and_only_its_owner_may_ask() -> None:
+    async def scenario() -> None:
+        async with living(TestCameras()) as cell:
+            cell.start(Request(), "rest")
+            with pytest.raises(Busy):
+                cell.start(Request(), "rest")
+            with pytest.raises(NotInControl, match="controlled by rest"):
+                cell.start(Request(), "modbus")
+            for ask in (lambda: cell.abort(1, "modbus"), lambda: cell.acknowledge(1, "modbus"),
+                        lambda: cell.withdraw("gone", "modbus"), lambda: cell.report(1, 1, 1, "modbus")):
+                with pytest.raises(NotInControl):
+                    ask()
+            assert dict(cell.snapshot().counts)["refused"] == 2
+
+    asyncio.run(scenario())
+
+
+def test_a_bad_request_is_refused_by_name_and_starts_nothing() -> None:
+    async def scenario() -> None:
+        async with living(released()) as cell:
+            for request, error in ((Request(recipe=9), UnknownItem), (Request(tool=9), UnknownItem),
+                                   (Request(bin=9), UnknownItem), (Request(frame="base"), FrameUnavailable)):
+                with pytest.raises(error):
+                    cell.start(request, "rest")
+            assert (cell.snapshot().phase, cell.snapshot().counts) == ("ready", ())
+
+    asyncio.run(scenario())
+
+
+def test_a_stuck_worker_delays_neither_the_timeout_nor_its_successor_once_it_is_back() -> None:
+    async def scenario() -> None:
+        cameras = TestCameras()
+        async with living(cameras) as cell:
+            started = time.monotonic()
+            cell.start(Request(timeout_ms=100), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert time.monotonic() - started < 2
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.TIMEOUT
+            assert (shown.current, shown.phase) == (0, "starting")
+            with pytest.raises(Busy, match="withdrawn"):
+                cell.start(Request(), "rest")
+            cameras.gate.set()
+            await until(cell, lambda s: s.phase == "ready")
+            cell.start(Request(), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            assert shown.published.result.cycle_id == 2
+            assert cell.finished(1) is not None
+
+    asyncio.run(scenario())
+
+
+def test_a_late_result_is_dropped_and_counted() -> None:
+    gate = threading.Event()
+
+    def slow(inputs: CycleInput, _proceed: Callable[[], None]) -> CycleResult:
+        gate.wait()
+        return good(inputs, lambda: None)
+
+    async def scenario() -> None:
+        async with living(released(), slow) as cell:
+            cell.start(Request(timeout_ms=100), "rest")
+            await until(cell, lambda s: s.valid)
+            gate.set()
+            shown = await until(cell, lambda s: s.phase == "ready")
+            assert dict(shown.counts)["late"] == 1
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.TIMEOUT
+
+    asyncio.run(scenario())
+
+
+def test_abort_ends_the_cycle_between_two_stages() -> None:
+    inside, stages = threading.Event(), []
+    gate = threading.Event()
+
+    def staged(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+        inside.set()
+        gate.wait()
+        proceed()
+        stages.append("second")
+        return good(inputs, proceed)
+
+    async def scenario() -> None:
+        async with living(released(), staged) as cell:
+            cycle_id = cell.start(Request(), "rest")
+            await asyncio.to_thread(inside.wait)
+            assert cell.snapshot().phase == "computing"
+            assert cell.snapshot().acquired
+            cell.abort(cycle_id, "rest")
+            kept = cell.result(cycle_id)
+            assert kept is not None
+            assert kept.return_code.code is Code.ABORTED
+            with pytest.raises(NotApplicable):
+                cell.abort(cycle_id, "rest")
+            gate.set()
+            shown = await until(cell, lambda s: s.phase == "ready")
+            assert stages == []
+            assert "late" not in dict(shown.counts)
+
+    asyncio.run(scenario())
+
+
+def test_dead_cameras_fail_the_cycle_by_name_then_are_opened_again() -> None:
+    async def scenario() -> None:
+        cameras = TestCameras()
+        async with living(cameras) as cell:
+            cell.start(Request(), "rest")
+            cameras.broken = "right"
+            cameras.gate.set()
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.CAMERAS
+            assert "right" in shown.published.result.return_code.message
+            assert shown.phase == "starting"
+            with pytest.raises(NotReady, match="right"):
+                cell.start(Request(), "rest")
+            cameras.broken = ""
+            await until(cell, lambda s: s.phase == "ready")
+            cell.start(Request(), "rest")
+            await until(cell, lambda s: s.valid)
+
+    asyncio.run(scenario())
+
+
+def test_an_error_of_ours_fails_one_cycle_and_stays_visible_until_a_good_one() -> None:
+    failing = [True]
+
+    def fragile(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+        if failing[0]:
+            raise ZeroDivisionError("planted")
+        return good(inputs, proceed)
+
+    async def scenario() -> None:
+        async with living(released(), fragile) as cell:
+            cell.start(Request(), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            code = shown.published.result.return_code
+            assert (code.code, code.message) == (Code.NOT_READY, "internal error, see the log")
+            assert (shown.faults, shown.phase) == (("internal error, see the log",), "ready")
+            failing[0] = False
+            cell.start(Request(), "rest")
+            assert (await until(cell, lambda s: s.valid)).faults == ()
+
+    asyncio.run(scenario())
+
+
+def test_a_pipeline_error_of_the_tree_keeps_its_code() -> None:
+    def refuse(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+        raise InputError("the images are of another size than the rig")
+
+    async def scenario() -> None:
+        async with living(released(), refuse) as cell:
+            cell.start(Request(), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.BAD_ARGUMENT
+            assert shown.faults == ()
+
+    asyncio.run(scenario())
+
+
+def test_an_unread_result_expires() -> None:
+    async def scenario() -> None:
+        async with living(released(), result_max_age_ms=500) as cell:
+            cell.start(Request(), "rest")
+            await until(cell, lambda s: s.valid)
+            shown = await until(cell, lambda s: not s.valid)
+            assert shown.withdrawn == "older than 500 ms"
+            assert shown.published is not None
+
+    asyncio.run(scenario())
+
+
+def test_a_controller_that_goes_away_takes_its_cycle_along() -> None:
+    async def scenario() -> None:
+        cameras = TestCameras()
+        async with living(cameras) as cell:
+            cell.start(Request(), "rest")
+            cell.withdraw("the connection was lost", "rest")
+            shown = cell.snapshot()
+            assert (shown.current, shown.valid, shown.withdrawn) == (0, False, "the connection was lost")
+            assert shown.latest is not None
+            assert shown.latest.result.return_code.code is Code.ABORTED
+
+    asyncio.run(scenario())
+
+
+def test_stopping_ends_waiters_at_once_and_abandons_a_stuck_worker() -> None:
+    async def scenario() -> None:
+        cameras = TestCameras()
+        cell = Cell(cell_settings(), rig(), cameras, good, boot_id=7)
+        cell.launch()
+        await until(cell, lambda s: s.phase == "ready")
+        cell.start(Request(), "rest")
+        while not cameras.captures:
+            await asyncio.sleep(0.005)
+        cell.stop()
+        shown = cell.snapshot()
+        assert (shown.phase, shown.current, shown.valid) == ("stopping", 0, False)
+        with pytest.raises(NotReady, match="stopping"):
+            cell.start(Request(), "rest")
+        assert not await cell.close(0.05)
+        cameras.gate.set()
+        assert await cell.close(2)
+
+    asyncio.run(scenario())
