@@ -1,11 +1,48 @@
 """The order of the stages: one pure function from a cycle's input to its result."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
-from binpick.errors import FlangePoseMissing, FrameUnavailable
-from binpick.result import CycleInput, CycleResult, Request
+import numpy as np
+
+from binpick import geometry
+from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
+from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
+from binpick.geometry import Transform
+from binpick.grasp import clearance, gate, rank, suction
+from binpick.result import (
+    BinMessage,
+    CycleInput,
+    CycleResult,
+    FrameName,
+    Funnel,
+    GraspMessage,
+    Inputs,
+    PoseMessage,
+    RecipeMessage,
+    Request,
+    Result,
+    ReturnCode,
+    Sigma,
+    SyncMessage,
+    ToolMessage,
+)
 from binpick.rig import Rig
+from binpick.scene import bin as load_carrier
+from binpick.scene import heightmap
+from binpick.scene import segment as segmentation
+from binpick.scene.surface import surface
 from binpick.settings import Job
+from binpick.stereo import cloud, filter, match, rectify
+
+LEAST_MEASURED = 0.20
+"""Below this share of measured pixels in the window there is no depth to speak of."""
+EXACT_CHECKS = 40
+"""Candidates whose exact clearance is computed before giving up: they are in order of quality."""
+
+Proceed = Callable[[], None]
 
 
 def admit(rig: Rig, job: Job, request: Request) -> None:
@@ -18,6 +55,198 @@ def admit(rig: Rig, job: Job, request: Request) -> None:
             'the rig has no hand-eye calibration, so poses in "base" do not exist: ask for frame "camera" or "bin"')
 
 
-def run(inputs: CycleInput, proceed: Callable[[], None] = lambda: None) -> CycleResult:
-    """The cycle. `proceed` is called between stages and may raise to end it (time limit, abort)."""
-    raise NotImplementedError
+def run(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
+    """The cycle. `proceed` is called between stages and may raise to end it (time limit, abort).
+
+    Raises InputError for images that do not belong to the rig; a bad scene is a return code.
+    """
+    admit(inputs.rig, inputs.job, inputs.request)
+    clock = _Clock(proceed)
+    frames = _Frames.of(inputs)
+    with clock.stage("rectify"):
+        rect = rectify.rectification(inputs.rig)
+        box = load_carrier.search_box(inputs.job.bin, inputs.job.recipe.limits.above_rim_m)
+        view = rectify.visible(rect, inputs.rig, rectify.window(rect, frames.T_camera_bin, *box))
+        rectified = rectify.rectify(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, view)
+    with clock.stage("match"):
+        matched = match.match(rectified, inputs.job.recipe.stereo)
+    with clock.stage("filter"):
+        depth = filter.measure(matched, rectified, inputs.job.recipe.stereo)
+    with clock.stage("cloud"):
+        points = cloud.reproject(depth, rectified)
+    return _scene(inputs, frames, clock, rectified, depth, points)
+
+
+def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Rectified, depth: Depth,
+           points: OrganisedCloud) -> CycleResult:
+    """From depth to the answer."""
+    job = inputs.job
+    T_bin_camera = geometry.inverse(frames.T_camera_bin)
+    with clock.stage("bin"):
+        measured = float(depth.measured.mean())
+        xyz_bin = geometry.transform(T_bin_camera, points.xyz)
+        heights = heightmap.height_map(xyz_bin, job.bin)
+        filled = load_carrier.filling(heights, job.bin)
+    seen = CycleResult(_answer(inputs, frames, clock, Code.NO_DEPTH, filled), rectified, depth, points)
+    if measured < LEAST_MEASURED:
+        return seen
+    with clock.stage("segment"):
+        grid = surface(depth, rectified, T_bin_camera)
+        segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
+    with clock.stage("grasp"):
+        found, counts = suction.candidates(segments, job.tool, grid.sigma_z_m)
+    with clock.stage("clearance"):
+        kept, clear_counts = _clear(found, segments, heights, inputs)
+    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **clear_counts}
+    messages, gate_counts = _publishable(kept, inputs, frames)
+    counts |= gate_counts
+    code = _code(filled, counts, messages)
+    result = _answer(inputs, frames, clock, code, filled, messages if code.carries_poses else (), counts)
+    return replace(seen, result=result, segments=segments)
+
+
+def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, inputs: CycleInput,
+           ) -> tuple[list[Grasp], dict[str, int]]:
+    """The best grasps whose tool touches nothing, in order, with their clearance."""
+    job, wanted = inputs.job, inputs.request.max_grasps or inputs.job.recipe.max_grasps
+    sieve = clearance.blocked(found, job.tool, heights)
+    ordered = rank.rank([g for g, hit in zip(found, sieve, strict=True) if not hit], segments, heights, job.tool)
+    scene = clearance.obstacles(heights, job.bin)
+    kept: list[Grasp] = []
+    collide = int(sieve.sum())
+    for grasp in ordered[:EXACT_CHECKS]:
+        distance_m = clearance.clearance(grasp, job.tool, scene)
+        if distance_m < job.recipe.limits.margin_m:
+            collide += 1
+            continue
+        kept.append(replace(grasp, clearance_m=distance_m))
+        if len(kept) == wanted:
+            break
+    return kept, {"collide": collide, "clear": len(kept)}
+
+
+def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tuple[tuple[GraspMessage, ...], dict[str, int]]:
+    """The grasps in the frame asked for, as they leave; what the last gate stops is counted by its objection."""
+    job = inputs.job
+    T_frame_bin = frames.T_frame_bin(inputs.request.frame or job.recipe.frame)
+    T_bin_frame = geometry.inverse(T_frame_bin)
+    T_reach_frame = frames.T_reach_bin @ T_bin_frame
+    messages: list[GraspMessage] = []
+    stopped: dict[str, int] = {}
+    fresh = all(f.received_ns > f.triggered_ns for f in (inputs.pair.left, inputs.pair.right))
+    for grasp in kept:
+        message = _message(grasp, inputs, T_frame_bin, len(messages) + 1)
+        objection = gate.objection(message, T_bin_frame, T_reach_frame, job.bin, job.tool, job.recipe.limits)
+        if not fresh:
+            objection = "older_than_trigger"
+        if objection:
+            stopped[f"gate_{objection}"] = stopped.get(f"gate_{objection}", 0) + 1
+        else:
+            messages.append(message)
+    return tuple(messages), {**stopped, "published": len(messages)}
+
+
+def _message(grasp: Grasp, inputs: CycleInput, T_frame_bin: Transform, number: int) -> GraspMessage:
+    tool = inputs.job.tool
+    T_frame_tcp = T_frame_bin @ grasp.T_bin_tcp
+    return GraspMessage(
+        id=f"{inputs.cycle_id}-{number}", rank=number, tool=ToolMessage(number=tool.number, name=tool.name, kind=tool.kind),
+        frame=inputs.request.frame or inputs.job.recipe.frame, **_pose(T_frame_tcp).model_dump(),
+        T_frame_pregrasp=_pose(T_frame_tcp @ geometry.translation(0, 0, -tool.approach_m)), approach_m=tool.approach_m,
+        lift_m=tool.lift_m, open_m=grasp.open_m, close_m=grasp.close_m, quality=grasp.quality, part_id=grasp.part_id,
+        sigma=Sigma(xy_m=grasp.sigma_xy_m, z_m=grasp.sigma_z_m, tilt_rad=grasp.sigma_tilt_rad), clearance_m=grasp.clearance_m)
+
+
+def _pose(T: Transform) -> PoseMessage:
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = geometry.quaternion(T).tolist()
+    return PoseMessage(position_m=(x, y, z), quaternion_xyzw=(qx, qy, qz, qw))
+
+
+def _code(filled: load_carrier.Filling, counts: dict[str, int], messages: tuple[GraspMessage, ...]) -> Code:
+    """The outcome of a measured scene; empty only when proved."""
+    if messages:
+        return Code.OVERFILLED if filled.overfilled else Code.OK
+    if counts["clear"]:
+        return Code.ALL_OUT_OF_REACH
+    if counts["collide"]:
+        return Code.ALL_COLLIDE
+    if filled.proved_empty:
+        return Code.BIN_EMPTY
+    return Code.NOTHING_GRASPABLE if filled.occupied else Code.BIN_UNKNOWN
+
+
+REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "collide")
+
+
+def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling,
+            grasps: tuple[GraspMessage, ...] = (), counts: dict[str, int] | None = None) -> Result:
+    pair, job = inputs.pair, inputs.job
+    lost = {k: v for k, v in (counts or {}).items() if v and (k in REASONS or k.startswith("gate_"))}
+    return Result(
+        cycle_id=inputs.cycle_id, request=inputs.request, captured_at=pair.captured_at, simulated=inputs.simulated,
+        return_code=ReturnCode.of(code),
+        bin=BinMessage(found=True, number=job.bin.number, T_camera_bin=_pose(frames.T_camera_bin), fill_level=filled.level,
+                       coverage=filled.coverage),
+        grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
+        sync=SyncMessage(skew_us=pair.skew_us, sigma_us=pair.sigma_us, proof=pair.proof,
+                         resends=pair.left.resends + pair.right.resends, missing=pair.left.missing + pair.right.missing),
+        timing_ms=clock.spent(),
+        inputs=Inputs(rig_sha256=inputs.rig.sha256, settings_sha256=job.sha256,
+                      frame_ids=(pair.left.frame_id, pair.right.frame_id),
+                      recipe=RecipeMessage(number=job.recipe.number, name=job.recipe.name, sha256=job.recipe_sha256)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    """Where camera, bin and base stand to each other in this cycle."""
+
+    T_camera_bin: Transform
+    T_base_camera: Transform | None
+
+    @classmethod
+    def of(cls, inputs: CycleInput) -> "_Frames":
+        rig, flange = inputs.rig, inputs.request.T_base_flange
+        T_base_camera = None
+        if rig.T_base_rig is not None:
+            T_base_camera = np.array(rig.T_base_rig)
+        elif rig.T_flange_rig is not None and flange is not None:
+            T_base_flange = geometry.from_quaternion(np.array(flange.position_m), np.array(flange.quaternion_xyzw))
+            T_base_camera = T_base_flange @ np.array(rig.T_flange_rig)
+        return cls(load_carrier.place(inputs.job.bin, T_base_camera), T_base_camera)
+
+    def T_frame_bin(self, frame: FrameName) -> Transform:
+        """Maps bin coordinates to the frame of that name; `admit` has proved that it exists."""
+        if frame == "bin":
+            return np.eye(4)
+        if frame == "camera":
+            return self.T_camera_bin
+        if self.T_base_camera is None:
+            raise FrameUnavailable('poses in "base" need a hand-eye calibration')
+        T_base_bin: Transform = self.T_base_camera @ self.T_camera_bin
+        return T_base_bin
+
+    @property
+    def T_reach_bin(self) -> Transform:
+        """The reach box lives in the base where there is one, else in the camera's frame."""
+        return self.T_frame_bin("camera" if self.T_base_camera is None else "base")
+
+
+@dataclass(slots=True)
+class _Clock:
+    """Times the stages, and asks between them whether to go on."""
+
+    proceed: Proceed
+    stages: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Times one stage under its name."""
+        self.proceed()
+        began = time.perf_counter()
+        yield
+        self.stages[name] = round((time.perf_counter() - began) * 1000, 3)
+
+    def spent(self) -> dict[str, float]:
+        """Milliseconds per stage, and their sum as `compute`."""
+        return {**self.stages, "compute": round(sum(self.stages.values()), 3)}

@@ -4,9 +4,9 @@ from binpick.settings.cell import Cell
 from binpick.settings.file import load, parse, schema
 from binpick.settings.job import Job, resolve
 from binpick.settings.recipe import Bin, Limits, PartSize, Pose, Reach, Recipe, SegmentSettings, StereoSettings
-from binpick.settings.tool import Box, Cup, Cylinder, Tool, Wrist
+from binpick.settings.tool import Body, Box, Cup, Cylinder, Tool, Wrist
 
 __all__ = [
-    "Bin", "Box", "Cell", "Cup", "Cylinder", "Job", "Limits", "PartSize", "Pose", "Reach", "Recipe", "SegmentSettings",
+    "Bin", "Body", "Box", "Cell", "Cup", "Cylinder", "Job", "Limits", "PartSize", "Pose", "Reach", "Recipe", "SegmentSettings",
     "StereoSettings", "Tool", "Wrist", "load", "parse", "resolve", "schema",
 ]

@@ -24,6 +24,11 @@ class Job(Strict):
         """Names these settings in a result."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
+    @property
+    def recipe_sha256(self) -> str:
+        """Names the recipe alone."""
+        return hashlib.sha256(self.recipe.model_dump_json().encode()).hexdigest()
+
 
 def resolve(cell: Cell, recipe: int = 0, bin_number: int = 0, tool: int = 0) -> Job:
     """The job of a request's numbers; 0 means the recipe's own, or the first. Raises UnknownItem."""

@@ -42,7 +42,7 @@ class Cylinder(Strict):
     """Where the body sits relative to the TCP."""
 
 
-Body = Annotated[Box | Cylinder, Field(discriminator="shape")]
+Body = Box | Cylinder
 
 
 class Wrist(Strict):
@@ -66,7 +66,7 @@ class Tool(Strict):
     """The TCP in the robot's flange frame."""
     cups: Annotated[tuple[Cup, ...], Field(min_length=1, max_length=1)] = (Cup(),)
     """The cups."""
-    bodies: tuple[Body, ...] = (
+    bodies: Annotated[tuple[Annotated[Body, Field(discriminator="shape")], ...], Field(min_length=1)] = (
         Cylinder(shape="cylinder", radius_m=0.009, length_m=0.018, T_tcp_body=Placement(position_m=(0, 0, -0.011))),
         Cylinder(shape="cylinder", radius_m=0.012, length_m=0.18, T_tcp_body=Placement(position_m=(0, 0, -0.11))),
         Cylinder(shape="cylinder", radius_m=0.04, length_m=0.05, T_tcp_body=Placement(position_m=(0, 0, -0.225))),

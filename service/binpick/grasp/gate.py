@@ -1,0 +1,40 @@
+"""The last gate: looks at each pose as it will leave the house, and trusts nothing that was computed before."""
+
+import numpy as np
+
+from binpick import geometry
+from binpick.geometry import Transform
+from binpick.result import GraspMessage
+from binpick.settings import Bin, Limits, Tool
+
+UNIT = 1e-6
+"""A quaternion's length may differ from 1 by this: what is left of float64 after a round trip through the wire."""
+OUTSIDE_M = 0.01
+"""A TCP may lie this far outside the bin's box: calibration and bin pose are not exact."""
+TILT_RAD = 0.02
+"""Tilt may exceed the tool's limit by this: rounding, and the bin's own tilt in the base frame."""
+
+
+def objection(grasp: GraspMessage, T_bin_frame: Transform, T_reach_frame: Transform, model: Bin, tool: Tool,
+              limits: Limits) -> str:
+    """Why a pose must not leave, or "".
+
+    `T_bin_frame` and `T_reach_frame` map the grasp's frame to the bin's and to the reach box's.
+    """
+    numbers = np.array([*grasp.position_m, *grasp.quaternion_xyzw, grasp.approach_m, grasp.lift_m, grasp.quality])
+    if not np.isfinite(numbers).all():
+        return "not_finite"
+    if abs(np.linalg.norm(grasp.quaternion_xyzw) - 1) > UNIT:
+        return "quaternion"
+    T_frame_tcp = geometry.from_quaternion(np.array(grasp.position_m), np.array(grasp.quaternion_xyzw))
+    T_bin_tcp, reach = T_bin_frame @ T_frame_tcp, (T_reach_frame @ T_frame_tcp)[:3, 3]
+    length, width, height = model.inner_size_m
+    low = np.array([-length / 2, -width / 2, 0]) - OUTSIDE_M
+    high = np.array([length / 2, width / 2, height + limits.above_rim_m]) + OUTSIDE_M
+    if (T_bin_tcp[:3, 3] < low).any() or (T_bin_tcp[:3, 3] > high).any():
+        return "outside_bin"
+    if (reach < limits.reach.min_m).any() or (reach > limits.reach.max_m).any():
+        return "out_of_reach"
+    if np.arccos(np.clip(-T_bin_tcp[2, 2], -1, 1)) > tool.max_tilt_rad + TILT_RAD:
+        return "tilt"
+    return ""

@@ -1,0 +1,58 @@
+"""The order of grasps: named terms, quantised and stable, so that the same scene gives the same bytes."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from binpick.data import Grasp, HeightMap, Segments
+from binpick.settings import Tool
+
+WEIGHTS = {"height": 0.30, "seal": 0.30, "area": 0.15, "upright": 0.15, "centre": 0.10}
+"""Shares of the quality; they sum to 1. Height first frees the parts below."""
+SAME_SPOT_M = 0.010
+SAME_TILT_RAD = np.radians(15)
+PER_PART = 2
+"""At most this many grasps of one part."""
+
+
+def rank(grasps: list[Grasp], segments: Segments, heights: HeightMap, tool: Tool) -> list[Grasp]:
+    """Best first, with qualities, without near-duplicates, at most two per part."""
+    labels, counts = np.unique(segments.parts[segments.parts > 0], return_counts=True)
+    area_px = dict(zip(labels.tolist(), counts.tolist(), strict=True))
+    centre = {label: segments.xyz[segments.parts == label].mean(axis=0) for label in segments.part_confidence}
+    largest = max(area_px.values(), default=1)
+    top = float(np.nanmax(heights.height, initial=1e-3))
+    scored = []
+    for grasp in grasps:
+        offset = float(np.linalg.norm(grasp.T_bin_tcp[:3, 3] - centre[grasp.part_id]))
+        tilt = float(np.arccos(np.clip(-grasp.T_bin_tcp[2, 2], -1, 1)))
+        terms = {
+            "height": float(np.clip(grasp.T_bin_tcp[2, 3] / top, 0, 1)),
+            "seal": float(np.clip(1 - grasp.seal_rms_m / tool.compliance_m, 0, 1)),
+            "area": float(np.sqrt(area_px[grasp.part_id] / largest)),
+            "upright": 1 - tilt / max(tool.max_tilt_rad, 1e-6) if tool.max_tilt_rad else 1.0,
+            "centre": float(np.clip(1 - offset / 0.03, 0, 1)),
+        }
+        quality = segments.part_confidence[grasp.part_id] * sum(WEIGHTS[name] * value for name, value in terms.items())
+        scored.append(replace(grasp, quality=round(float(np.clip(quality, 0, 1)), 3)))
+    return _distinct(sorted(scored, key=_key))
+
+
+def _key(grasp: Grasp) -> tuple[float, ...]:
+    """Quality to 0.001, then height, x, y to 1 mm: noise in the last bits cannot swap two grasps."""
+    x, y, z = (round(float(v) * 1000) for v in grasp.T_bin_tcp[:3, 3])
+    return (-grasp.quality, -z, x, y, *np.round(grasp.T_bin_tcp[:3, 2], 2).tolist())
+
+
+def _distinct(ordered: list[Grasp]) -> list[Grasp]:
+    kept: list[Grasp] = []
+    for grasp in ordered:
+        mine = [other for other in kept if other.part_id == grasp.part_id]
+        if len(mine) < PER_PART and not any(_alike(grasp, other) for other in mine):
+            kept.append(grasp)
+    return kept
+
+
+def _alike(a: Grasp, b: Grasp) -> bool:
+    near = np.linalg.norm(a.T_bin_tcp[:3, 3] - b.T_bin_tcp[:3, 3]) < SAME_SPOT_M
+    return bool(near and a.T_bin_tcp[:3, 2] @ b.T_bin_tcp[:3, 2] > np.cos(SAME_TILT_RAD))

@@ -1,0 +1,200 @@
+"""Suction grasps: where a lip of the cup's size lies on one part within its compliance, on measured points only."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32
+
+from binpick import geometry
+from binpick.data import Grasp, Labels, Segments
+from binpick.geometry import Transform
+from binpick.settings import Tool
+
+FIT_RADIUS = 1.1
+"""The plane is fitted, and the seal judged, within this many lip radii."""
+SKIRT_RADIUS = 1.5
+"""Within this many lip radii nothing may stand out of the plane: there the cup's own body comes down."""
+STAND_OUT_M = 0.0015
+"""What stands out further than this beside the lip keeps the cup from closing."""
+SEAL_SHARE = 0.85
+"""The measured surface may use this share of the compliance: the rest is for the measurement's own noise."""
+SECTORS = 16
+"""The lip is judged in this many sectors; each must show the part."""
+CORRELATED_PX = 8.0
+"""Half-resolution pixels that share one independent depth error: a matched block of 5x5 full-resolution pixels and the
+matcher's smoothness."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """The points around each of n spots, in the spot's frame (origin there, z along the normal); NaN = not measured."""
+
+    local: Float32[np.ndarray, "n k 3"]
+    own: Bool[np.ndarray, "n k"]
+
+
+def candidates(segments: Segments, tool: Tool, sigma_z_m: Float32[np.ndarray, "h w"]) -> tuple[list[Grasp], dict[str, int]]:
+    """All grasps whose lip seals and whose tilt the tool allows, and how many spots fell out for which reason.
+
+    Qualities are 0 until ranked. The pose's z points into the part, x along the part's longest extent.
+    """
+    cup = tool.cups[0]
+    spots = _spots(segments)
+    reasons = {"spots": len(spots)}
+    if not len(spots):
+        return [], reasons
+    patch, T_bin_spot = _patches(segments, spots, cup.radius_m)
+    seal = _seal(patch, cup.radius_m)
+    tilt = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1))
+    limits = {
+        "rim_not_on_one_part": seal.sectors >= SECTORS,
+        "no_seal": (seal.deviation_m <= SEAL_SHARE * tool.compliance_m) & (seal.stand_out_m <= STAND_OUT_M),
+        "tilt": tilt <= tool.max_tilt_rad,
+    }
+    alive = np.ones(len(spots), dtype=bool)
+    for reason, passed in limits.items():
+        reasons[reason] = int((alive & ~passed).sum())
+        alive &= passed
+    long_axes = _long_axes(segments)
+    grasps = [_grasp(i, segments, spots, seal, T_bin_spot, long_axes, tool, sigma_z_m) for i in np.flatnonzero(alive).tolist()]
+    reasons["sealed"] = len(grasps)
+    return grasps, reasons
+
+
+def _spots(segments: Segments) -> Int32[np.ndarray, "n 2"]:
+    """Pixels (row, column) worth a try: on faces and on parts, where the border is locally farthest away."""
+    found = [_peaks(labels) for labels in (segments.faces, segments.parts)]
+    spots = np.unique(np.concatenate(found), axis=0).astype(np.int32)
+    usable = np.isfinite(segments.normal[spots[:, 0], spots[:, 1]]).all(axis=1)
+    usable &= segments.parts[spots[:, 0], spots[:, 1]] > 0
+    kept: Int32[np.ndarray, "m 2"] = spots[usable]
+    return kept
+
+
+def _peaks(labels: Labels) -> Int32[np.ndarray, "n 2"]:
+    """Local maxima of the distance to the segment's border."""
+    inner = labels > 0
+    inner[:, 1:] &= labels[:, 1:] == labels[:, :-1]
+    inner[1:] &= labels[1:] == labels[:-1]
+    distance = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5)
+    highest = cv2.dilate(distance, np.ones((7, 7), dtype=np.uint8))
+    return np.argwhere((distance >= highest) & (distance > 2)).astype(np.int32)
+
+
+def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: float,
+             ) -> tuple[Patch, Float64[np.ndarray, "n 4 4"]]:
+    """The neighbourhood of every spot in its own frame."""
+    rows, cols = segments.parts.shape
+    near = segments.xyz[spots[:, 0], np.minimum(spots[:, 1] + 1, cols - 1)] - segments.xyz[spots[:, 0], spots[:, 1]]
+    spacing_m = float(np.nanmedian(np.linalg.norm(near, axis=1)))
+    reach = int(np.ceil(SKIRT_RADIUS * 1.3 * radius_m / max(spacing_m, 1e-4)))
+    steps = np.arange(-reach, reach + 1)
+    i = np.clip(spots[:, 0, None, None] + steps[None, :, None], 0, rows - 1)
+    j = np.clip(spots[:, 1, None, None] + steps[None, None, :], 0, cols - 1)
+    i, j = (np.broadcast_to(a, (len(spots), len(steps), len(steps))).reshape(len(spots), -1) for a in (i, j))
+    origin = segments.xyz[spots[:, 0], spots[:, 1]].astype(np.float64)
+    normal = segments.normal[spots[:, 0], spots[:, 1]].astype(np.float64)
+    T_bin_spot = np.stack([geometry.frame_of_axes(n, np.array([1.0, 0, 0]), o) for n, o in zip(normal, origin, strict=True)])
+    offset = segments.xyz[i, j] - origin[:, None].astype(np.float32)
+    local = np.einsum("nkc,nca->nka", offset, T_bin_spot[:, :3, :3].astype(np.float32))
+    own = segments.parts[i, j] == segments.parts[spots[:, 0], spots[:, 1]][:, None]
+    return Patch(local=local, own=own), T_bin_spot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seal:
+    """The lip's fit on each spot: plane slopes and level in the spot's frame, and how far the surface leaves it."""
+
+    slope: Float64[np.ndarray, "n 2"]
+    level_m: Float64[np.ndarray, "n"]
+    centre_m: Float64[np.ndarray, "n"]
+    rms_m: Float64[np.ndarray, "n"]
+    deviation_m: Float64[np.ndarray, "n"]
+    stand_out_m: Float64[np.ndarray, "n"]
+    sectors: Int32[np.ndarray, "n"]
+    support: Int32[np.ndarray, "n"]
+
+    def normal_bin(self, T_bin_spot: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 3"]:
+        """Unit normals of the fitted planes in the bin's frame."""
+        local = np.concatenate([-self.slope, np.ones((len(self.slope), 1))], axis=1)
+        local /= np.linalg.norm(local, axis=1, keepdims=True)
+        normals: Float64[np.ndarray, "n 3"] = np.einsum("nac,nc->na", T_bin_spot[:, :3, :3], local)
+        return normals
+
+
+def _seal(patch: Patch, radius_m: float) -> Seal:
+    """Least-squares plane of the own points under the lip, and the residuals that matter.
+
+    `deviation_m` is the 90th percentile of the lip zone's residuals: a maximum would be the noise's, not the surface's.
+    """
+    x, y, z = (patch.local[..., a].astype(np.float64) for a in range(3))
+    known = np.isfinite(z)
+    x, y, z = (np.where(known, a, 0.0) for a in (x, y, z))
+    radius = np.hypot(x, y)
+    under = known & patch.own & (radius <= FIT_RADIUS * radius_m) & (np.abs(z) < radius_m)
+    slope, level = _fit_planes(x, y, z, under)
+    residual = z - level[:, None] - slope[:, :1] * x - slope[:, 1:] * y
+    lip = known & (radius >= 0.7 * radius_m) & (radius <= 1.15 * radius_m)
+    own_lip = lip & patch.own
+    sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * SECTORS).astype(np.int32) % SECTORS
+    sectors = np.zeros(len(z), dtype=np.int32)
+    for s in range(SECTORS):
+        here = sector == s
+        own, others = (own_lip & here).sum(axis=1), (lip & here & ~patch.own).sum(axis=1)
+        sectors += (own >= 2) & (own >= 3 * others)
+    skirt = known & (radius <= SKIRT_RADIUS * radius_m)
+    n = np.maximum(under.sum(axis=1), 1)
+    middle = under & (radius <= 0.4 * radius_m)
+    return Seal(
+        slope=slope, level_m=level, sectors=sectors, support=under.sum(axis=1).astype(np.int32),
+        centre_m=np.where(middle, residual, 0).sum(axis=1) / np.maximum(middle.sum(axis=1), 1),
+        rms_m=np.sqrt(np.where(under, residual**2, 0).sum(axis=1) / n),
+        deviation_m=_quantile(np.abs(residual), under & (radius >= 0.6 * radius_m), 0.90),
+        stand_out_m=_quantile(residual, skirt, 0.98))
+
+
+def _fit_planes(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], z: Float64[np.ndarray, "n k"],
+                under: Bool[np.ndarray, "n k"]) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n"]]:
+    """z = level + slope · (x, y) by normal equations; a microscopic ridge (1 µm²) keeps spots without points solvable."""
+    columns = np.stack([x, y, np.ones_like(x)], axis=-1) * under[..., None]
+    normal = np.einsum("nka,nkb->nab", columns, columns) + np.eye(3) * 1e-12
+    right = np.einsum("nka,nk->na", columns, z)
+    solved = np.linalg.solve(normal, right[..., None])[..., 0]
+    return solved[:, :2], solved[:, 2]
+
+
+def _quantile(values: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"], share: float) -> Float64[np.ndarray, "n"]:
+    """The quantile over each row's selected values; inf where a row has none."""
+    ordered = np.sort(np.where(of, values, np.inf), axis=1)
+    count = of.sum(axis=1)
+    index = np.maximum(np.ceil(share * count).astype(int) - 1, 0)
+    picked: Float64[np.ndarray, "n"] = np.take_along_axis(ordered, index[:, None], axis=1)[:, 0]
+    return picked
+
+
+def _long_axes(segments: Segments) -> dict[int, geometry.Vector]:
+    """The direction of the longest extent of every part, bin frame, sign fixed (first non-zero component positive)."""
+    axes = {}
+    for label in segments.part_confidence:
+        points = segments.xyz[segments.parts == label].astype(np.float64)
+        _, vectors = np.linalg.eigh(np.cov(points.T))
+        axis = vectors[:, 2]
+        axes[label] = axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
+    return axes
+
+
+def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal, T_bin_spot: Float64[np.ndarray, "n 4 4"],
+           long_axes: dict[int, geometry.Vector], tool: Tool, sigma_z_m: Float32[np.ndarray, "h w"]) -> Grasp:
+    row, col = int(spots[i, 0]), int(spots[i, 1])
+    part = int(segments.parts[row, col])
+    normal = seal.normal_bin(T_bin_spot)[i]
+    # on a curved part the lip's middle lies on the surface, not on the plane through its rim
+    point_local = np.array([0.0, 0.0, seal.level_m[i] + seal.centre_m[i]])
+    T_bin_tcp: Transform = geometry.frame_of_axes(-normal, long_axes[part], geometry.transform(T_bin_spot[i], point_local))
+    sigma_px_m = float(sigma_z_m[row, col])
+    independent = max(1.0, float(seal.support[i]) / CORRELATED_PX)
+    radius_m = tool.cups[0].radius_m
+    return Grasp(T_bin_tcp=T_bin_tcp, tool=tool.number, part_id=part, open_m=0.0, close_m=0.0, quality=0.0,
+                 seal_rms_m=float(seal.rms_m[i]), sigma_xy_m=sigma_px_m / 2, sigma_z_m=sigma_px_m / np.sqrt(independent),
+                 sigma_tilt_rad=float(2 * sigma_px_m / radius_m / np.sqrt(independent)))

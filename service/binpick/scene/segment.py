@@ -1,0 +1,85 @@
+"""Tells parts apart by the recipe's method, and keeps what has the size of a part."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from binpick.data import Labels, Mask, Segments, frozen
+from binpick.scene import euclid, grid
+from binpick.scene.bin import FLOOR_M
+from binpick.scene.surface import Surface
+from binpick.settings import Bin, PartSize, SegmentSettings
+
+WALL_M = 0.003
+"""Points this near a wall may be the wall."""
+METHODS = {"grid": grid.segment, "open3d": euclid.segment}
+
+
+def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSettings) -> Segments:
+    """Faces and parts inside the bin and above its floor."""
+    of_interest = _inside(surface, model)
+    faces, parts = METHODS[settings.method](surface, of_interest, settings)
+    spacing_m = _spacing(surface, of_interest)
+    least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
+    faces, parts = _drop_small(faces, least), _drop_small(parts, least)
+    return Segments(xyz=frozen(surface.xyz), normal=frozen(surface.normal), faces=frozen(faces), parts=frozen(parts),
+                    part_confidence=_confidence(surface, parts, part))
+
+
+def _inside(surface: Surface, model: Bin) -> Mask:
+    """Measured points with a normal, above the floor and not of a wall."""
+    length, width, _ = model.inner_size_m
+    x, y, z = surface.xyz[..., 0], surface.xyz[..., 1], surface.xyz[..., 2]
+    with np.errstate(invalid="ignore"):
+        above = z > np.maximum(np.float32(FLOOR_M / 2), 3 * surface.sigma_z_m)
+        inside = (np.abs(x) < length / 2 - WALL_M) & (np.abs(y) < width / 2 - WALL_M)
+    return np.asarray(above & inside & np.isfinite(surface.normal[..., 0]))
+
+
+def _spacing(surface: Surface, of_interest: Mask) -> float:
+    """Median distance of neighbouring points, metres; 0 when there are none."""
+    step = np.linalg.norm(surface.xyz[:, 1:] - surface.xyz[:, :-1], axis=-1)[of_interest[:, 1:] & of_interest[:, :-1]]
+    return float(np.median(step)) if step.size else 0.0
+
+
+def _drop_small(labels: Labels, least: int) -> Labels:
+    """Only segments of at least `least` pixels, counted anew from 1 in reading order."""
+    sizes = np.bincount(labels.ravel())
+    keep = sizes >= least
+    keep[0] = False
+    renumbered = np.zeros(len(sizes), dtype=np.int32)
+    renumbered[keep] = np.arange(1, int(keep.sum()) + 1, dtype=np.int32)
+    kept: Labels = renumbered[labels]
+    return kept
+
+
+def _confidence(surface: Surface, parts: Labels, part: PartSize) -> dict[int, float]:
+    """How sure a segment is one part: its extent against the largest part's, and how well it fills its outline's hull.
+
+    A segment grown over two parts is long or ragged; its height must not win by itself, so this multiplies the quality.
+    """
+    confidence = {}
+    for label, (rows, cols) in _boxes(parts).items():
+        mask = parts[rows, cols] == label
+        points = surface.xyz[rows, cols][mask][:, :2]
+        (_, (a, b), _) = cv2.minAreaRect(points.astype(np.float32))
+        excess = max(a, b) / part.max_size_m
+        outline = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+        hull = cv2.convexHull(np.concatenate(outline))
+        solidity = float(mask.sum()) / max(float(cv2.contourArea(hull)), float(mask.sum()), 1.0)
+        confidence[label] = round(float(np.clip(2 - excess, 0.1, 1)) * (0.4 + 0.6 * solidity), 4)
+    return confidence
+
+
+def _boxes(labels: Labels) -> dict[int, tuple[slice, slice]]:
+    """The pixel box of every label."""
+    rows, cols = np.nonzero(labels)
+    values: Int32[np.ndarray, "n"] = labels[rows, cols]
+    count = int(values.max()) if values.size else 0
+    box: Float64[np.ndarray, "4 n"] = np.array([np.full(count + 1, np.inf), np.full(count + 1, -1.0)] * 2)
+    np.minimum.at(box[0], values, rows)
+    np.maximum.at(box[1], values, rows)
+    np.minimum.at(box[2], values, cols)
+    np.maximum.at(box[3], values, cols)
+    return {i: (slice(int(box[0, i]), int(box[1, i]) + 1), slice(int(box[2, i]), int(box[3, i]) + 1))
+            for i in range(1, count + 1) if box[1, i] >= 0}

@@ -1,0 +1,125 @@
+"""The measured surface at half resolution: points and edge-preserving normals in the bin's frame.
+
+On a plane 1/z, and so disparity, is affine in the pixel coordinates; a plane fit in disparity is linear and its noise is
+even. Each pixel takes the fit of the window around it, of nine, that fits best, so a window across an edge never wins.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from binpick import geometry
+from binpick.data import Cloud, Depth, Mask, Rectified
+from binpick.geometry import Transform
+
+RADIUS = 3
+"""Half side of a fit window, half-resolution px: 7x7 are about 8 mm at 1 m."""
+SUPPORT = 0.5
+"""Least share of measured pixels in a fit window."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Points and unit normals (towards the camera) in the bin's frame, NaN = not measured; sigma_z_m of one pixel."""
+
+    xyz: Cloud
+    normal: Cloud
+    sigma_z_m: Float32[np.ndarray, "h w"]
+
+
+def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surface:
+    """The surface of the window at half resolution."""
+    disparity = _half(depth)
+    view = rectified.window
+    rows, cols = disparity.shape
+    # the centre of half-resolution pixel j lies at full-resolution 2 j + 0.5
+    u = (2 * np.arange(cols) + 0.5 + view.x - rectified.cx_px).astype(np.float32)
+    v = (2 * np.arange(rows) + 0.5 + view.y - rectified.cy_px).astype(np.float32)
+    slope_u, slope_v, level = _planes(disparity)
+    f = np.float32(rectified.focal_px)
+    # a u + b v + c = f b / z  =>  n ~ (a f, b f, a (u - cx) .. + c) with u, v counted from the principal point
+    a, b = slope_u / 2, slope_v / 2
+    c = level - a * u[None, :] - b * v[:, None]
+    normal = np.stack([a * f, b * f, c], axis=-1)
+    normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
+    z = np.float32(rectified.focal_px * rectified.baseline_m) / disparity
+    rect = np.stack([z * u[None, :] / f, z * v[:, None] / f, z], axis=-1)
+    T_bin_rect = T_bin_camera @ rectified.T_camera_rect
+    sigma = z * z * np.float32(depth.sigma_px / (rectified.focal_px * rectified.baseline_m))
+    return Surface(xyz=geometry.transform(T_bin_rect, rect), normal=geometry.rotate(T_bin_rect, normal), sigma_z_m=sigma)
+
+
+def _half(depth: Depth) -> Float32[np.ndarray, "h w"]:
+    """Mean disparity of each 2x2 block with at least two measured pixels, else NaN."""
+    rows, cols = depth.disparity.shape[0] // 2, depth.disparity.shape[1] // 2
+    known = depth.measured[:2 * rows, :2 * cols]
+    values = np.where(known, depth.disparity[:2 * rows, :2 * cols], np.float32(0))
+    total = cv2.resize(values, (cols, rows), interpolation=cv2.INTER_AREA)
+    weight = cv2.resize(known.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(weight >= 0.49, total / weight, np.float32(np.nan)).astype(np.float32)
+
+
+Field = Float32[np.ndarray, "h w"]
+
+
+def _planes(disparity: Field) -> tuple[Field, Field, Field]:
+    """Slopes per half-resolution px and level of the best plane at each measured pixel; NaN where none has support."""
+    known = np.isfinite(disparity)
+    slope_u, slope_v, level, misfit = _fits(disparity, known)
+    best = np.full(disparity.shape, np.inf, dtype=np.float32)
+    out = [np.full(disparity.shape, np.nan, dtype=np.float32) for _ in range(3)]
+    for dv in (0, -RADIUS, RADIUS):
+        for du in (0, -RADIUS, RADIUS):
+            error = _shift(misfit, du, dv, np.inf)
+            better = error < best
+            best = np.where(better, error, best)
+            a, b = _shift(slope_u, du, dv, np.nan), _shift(slope_v, du, dv, np.nan)
+            here = _shift(level, du, dv, np.nan) - a * du - b * dv
+            for target, value in zip(out, (a, b, here), strict=True):
+                np.copyto(target, value, where=better & known)
+    return out[0], out[1], out[2]
+
+
+def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
+    """Least-squares planes of the windows centred on every pixel, by box sums; misfit is inf without support.
+
+    Sums run in float64: the misfit is a small difference of large squares.
+    """
+    mid = float(np.nanmedian(disparity)) if known.any() else 0.0
+    d = np.where(known, disparity - np.float32(mid), np.float32(0)).astype(np.float64)
+    w = known.astype(np.float64)
+    ones = np.ones(2 * RADIUS + 1)
+    ramp = np.arange(-RADIUS, RADIUS + 1, dtype=np.float64)
+
+    def window(field: Float64[np.ndarray, "h w"], along_u: Float64[np.ndarray, "k"],
+               along_v: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "h w"]:
+        return np.asarray(cv2.sepFilter2D(field, cv2.CV_64F, along_u, along_v, borderType=cv2.BORDER_CONSTANT))
+
+    n = np.maximum(window(w, ones, ones), 1)
+    mean_u, mean_v, mean_d = window(w, ramp, ones) / n, window(w, ones, ramp) / n, window(d, ones, ones) / n
+    uu = window(w, ramp**2, ones) / n - mean_u**2
+    vv = window(w, ones, ramp**2) / n - mean_v**2
+    uv = window(w, ramp, ramp) / n - mean_u * mean_v
+    ud = window(d, ramp, ones) / n - mean_u * mean_d
+    vd = window(d, ones, ramp) / n - mean_v * mean_d
+    dd = window(d * d, ones, ones) / n - mean_d**2
+    det = uu * vv - uv * uv
+    usable = (n >= SUPPORT * ones.size**2) & (det > 0.5)
+    det = np.where(usable, det, 1)
+    a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
+    misfit = np.where(usable, np.maximum(dd - a * ud - b * vd, 0), np.inf)
+    level = mean_d - a * mean_u - b * mean_v + mid
+    a, b, level = (np.where(usable, field, np.nan) for field in (a, b, level))
+    return a.astype(np.float32), b.astype(np.float32), level.astype(np.float32), misfit.astype(np.float32)
+
+
+def _shift(field: Field, du: int, dv: int, outside: float) -> Field:
+    """The field's value at (u + du, v + dv)."""
+    moved = np.full_like(field, outside)
+    rows, cols = field.shape
+    moved[max(0, -dv):rows - max(0, dv), max(0, -du):cols - max(0, du)] = (
+        field[max(0, dv):rows - max(0, -dv), max(0, du):cols - max(0, -du)])
+    return moved

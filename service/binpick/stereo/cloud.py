@@ -1,0 +1,22 @@
+"""Disparity to XYZ: z = f b / d, on the window's pixel grid, in the camera's frame."""
+
+import numpy as np
+
+from binpick import geometry
+from binpick.data import Depth, OrganisedCloud, Rectified, frozen
+
+
+def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
+    """The organised cloud; sigma_z = z² sigma_d / (f b), the first-order noise of z = f b / d."""
+    view = rectified.window
+    u = (np.arange(view.width) + (view.x - rectified.cx_px)).astype(np.float32)
+    v = (np.arange(view.height) + (view.y - rectified.cy_px)).astype(np.float32)
+    depth_scale = np.float32(rectified.focal_px * rectified.baseline_m)
+    z = depth_scale / depth.disparity
+    rect = np.empty((*z.shape, 3), dtype=np.float32)
+    rect[..., 2] = z
+    np.multiply(z, u[None, :] / np.float32(rectified.focal_px), out=rect[..., 0])
+    np.multiply(z, v[:, None] / np.float32(rectified.focal_px), out=rect[..., 1])
+    xyz = geometry.transform(rectified.T_camera_rect, rect)
+    sigma_z_m = z * z * np.float32(depth.sigma_px) / depth_scale
+    return OrganisedCloud(xyz=frozen(xyz), sigma_z_m=frozen(sigma_z_m), window=view)

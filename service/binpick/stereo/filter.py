@@ -1,0 +1,62 @@
+"""Measured or not: WLS confidence, depth edges and speckle decide; the smoothed map is for people only."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int16
+
+from binpick.data import Depth, Mask, Rectified, frozen
+from binpick.settings import StereoSettings
+from binpick.stereo.match import SCALE, Matched
+
+SGBM_SIGMA_PX = 0.25
+"""1-sigma disparity noise of SGBM on projected dots, median over the exam's tuning scenes."""
+JUMP_PX = 2.0
+"""A disparity step between neighbours above this is a depth edge."""
+
+
+def measure(matched: Matched, rectified: Rectified, settings: StereoSettings) -> Depth:
+    """The depth of the window's pixels.
+
+    A pixel is measured when SGBM matched it, the WLS filter's left-right confidence reaches `min_confidence`, it is not
+    within `edge_px` of a depth edge and not in a speckle. OpenCV's filter wants the right disparity negated, which
+    its right matcher already delivers (opencv_contrib#2974).
+    """
+    wls = cv2.ximgproc.createDisparityWLSFilter(matched.matcher)
+    wls.setLambda(settings.wls_lambda)
+    wls.setSigmaColor(settings.wls_sigma_color)
+    filled = wls.filter(matched.left, rectified.left, disparity_map_right=matched.right)
+    margin = rectified.margin
+    confidence = wls.getConfidenceMap()[:, margin:].astype(np.uint8)
+    raw = np.ascontiguousarray(matched.left[:, margin:])
+    measured = gate(raw, settings) & (confidence >= settings.min_confidence)
+    disparity = raw.astype(np.float32) / SCALE + rectified.window.min_disparity
+    disparity[~measured] = np.nan
+    return Depth(disparity=frozen(disparity), filled=frozen(_absolute(filled[:, margin:], rectified.window.min_disparity)),
+                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=SGBM_SIGMA_PX)
+
+
+def gate(raw: Int16[np.ndarray, "h w"], settings: StereoSettings) -> Mask:
+    """Which raw disparities stand on firm ground: matched, away from depth edges, not in a speckle."""
+    sound: Bool[np.ndarray, "h w"] = raw >= 0
+    if settings.speckle_px:
+        speckled = raw.copy()
+        cv2.filterSpeckles(speckled, -SCALE, settings.speckle_px, 2 * SCALE)
+        sound &= speckled >= 0
+    if settings.edge_px:
+        sound &= ~_near_jump(raw, sound, settings.edge_px)
+    return sound
+
+
+def _near_jump(raw: Int16[np.ndarray, "h w"], sound: Mask, edge_px: int) -> Mask:
+    """Pixels within edge_px of a disparity step; holes are no steps."""
+    kernel = np.ones((3, 3), dtype=np.uint8)
+    highest = cv2.dilate(np.where(sound, raw, np.int16(-32768)), kernel)
+    lowest = cv2.erode(np.where(sound, raw, np.int16(32767)), kernel)
+    jump = (highest.astype(np.int32) - lowest > JUMP_PX * SCALE).astype(np.uint8)
+    if edge_px > 1:
+        jump = cv2.dilate(jump, np.ones((2 * edge_px - 1, 2 * edge_px - 1), dtype=np.uint8))
+    return np.asarray(jump > 0)
+
+
+def _absolute(disparity: Int16[np.ndarray, "h w"], min_disparity: int) -> Float32[np.ndarray, "h w"]:
+    return disparity.astype(np.float32) / SCALE + np.float32(min_disparity)
