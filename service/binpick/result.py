@@ -8,10 +8,13 @@ import functools
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from binpick import geometry
 from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.errors import Code
+from binpick.geometry import Transform
 from binpick.rig import Rig
 from binpick.settings import Job
 
@@ -210,6 +213,21 @@ class CycleInput:
     job: Job
     request: Request
     simulated: bool = False
+
+    @property
+    def T_base_camera(self) -> Transform | None:
+        """Maps camera coordinates to the robot's base: a fixed rig's own, or through the flange sent with the request.
+
+        None without a hand-eye calibration, or without a flange pose where the rig needs one.
+        """
+        if self.rig.T_base_rig is not None:
+            return np.array(self.rig.T_base_rig)
+        flange = self.request.T_base_flange
+        if self.rig.T_flange_rig is None or flange is None:
+            return None
+        T_base_flange = geometry.from_quaternion(np.array(flange.position_m), np.array(flange.quaternion_xyzw))
+        T_base_rig: Transform = T_base_flange @ np.array(self.rig.T_flange_rig)
+        return T_base_rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
