@@ -99,10 +99,16 @@ class Cell:
         self._board.step(machine.report, cycle_id, grasp, outcome)
         log.info("cycle %d grasp %d: outcome %d by %s", cycle_id, grasp, outcome, source)
 
-    def launch(self) -> None:
-        """Starts the worker thread, and the supervisor on the running loop."""
+    def launch(self) -> asyncio.Task[None]:
+        """Starts the worker thread, and the supervisor on the running loop, which ends only by `close` or by a defect."""
         self._supervisor = asyncio.get_running_loop().create_task(self._supervise(), name="binpick-supervisor")
         self._thread.start()
+        return self._supervisor
+
+    @property
+    def alive(self) -> bool:
+        """Whether the worker thread runs."""
+        return self._thread.is_alive()
 
     def stop(self) -> None:
         """READY falls, triggers are refused, what runs or holds is withdrawn; returns at once."""
@@ -113,15 +119,16 @@ class Cell:
         self.stop()
         loop = asyncio.get_running_loop()
         deadline = loop.time() + limit_s
-        while self._thread.is_alive() and loop.time() < deadline:
+        while self.alive and loop.time() < deadline:
             await asyncio.sleep(0.005)
         if self._supervisor is not None:
             self._supervisor.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._supervisor
-        if self._thread.is_alive():
+        ended = not self.alive
+        if not ended:
             log.warning("the cell's thread did not end within %.1f s and is abandoned", limit_s)
-        return not self._thread.is_alive()
+        return ended
 
     async def __aenter__(self) -> "Cell":
         self.launch()

@@ -1,35 +1,45 @@
-"""The last cycle's pictures and cloud, rendered when somebody asks and only once."""
+"""The last cycle's pictures and cloud, drawn when somebody asks and only once."""
 
 import threading
 
-from binpick.data import StereoPair
-from binpick.result import Artefact, CycleResult
+from binpick import artefacts
+from binpick.result import Artefact, CycleInput, CycleResult
+
+NAMES = frozenset({"cloud.ply", "overlay.png", "disparity.png", "confidence.png", "left.png", "right.png"})
+
+
+class Exhibit:
+    """One cycle's arrays, and what was drawn of them."""
+
+    def __init__(self, inputs: CycleInput, cycle: CycleResult) -> None:
+        self._inputs, self._cycle = inputs, cycle
+        self._drawing = threading.Lock()
+        self._drawn: dict[str, Artefact] = {}
+
+    @property
+    def cycle_id(self) -> int:
+        """Whose pictures these are."""
+        return self._inputs.cycle_id
+
+    def artefact(self, name: str) -> Artefact:
+        """A second caller of the same picture waits for the first instead of drawing it again."""
+        with self._drawing:
+            if name not in self._drawn:
+                self._drawn[name] = Artefact(*artefacts.render(self._inputs, self._cycle, name))
+            return self._drawn[name]
 
 
 class Gallery:
-    """Holds one cycle's arrays until the next one's take their place."""
+    """Shows one cycle until the next one's take its place; the worker that hangs them up never waits for a viewer."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._cycle: CycleResult | None = None
-        self._pair: StereoPair | None = None
-        self._rendered: dict[str, Artefact] = {}
+        self._shown: Exhibit | None = None
 
-    def keep(self, cycle: CycleResult, pair: StereoPair) -> None:
+    def keep(self, inputs: CycleInput, cycle: CycleResult) -> None:
         """Replaces the cycle shown."""
-        with self._lock:
-            self._cycle, self._pair, self._rendered = cycle, pair, {}
+        self._shown = Exhibit(inputs, cycle)
 
     def artefact(self, cycle_id: int, name: str) -> Artefact | None:
-        """The artefact of that cycle, or None when it is not the one kept or never came so far.
-
-        A second caller of the same picture waits for the first instead of drawing it again.
-        """
-        from binpick import artefacts
-
-        with self._lock:
-            if self._cycle is None or self._pair is None or self._cycle.result.cycle_id != cycle_id:
-                return None
-            if name not in self._rendered:
-                self._rendered[name] = Artefact(*artefacts.render(self._cycle, self._pair, name))
-            return self._rendered[name]
+        """The artefact of that cycle; None when another cycle is shown, or there is no such picture."""
+        shown = self._shown
+        return shown.artefact(name) if shown is not None and shown.cycle_id == cycle_id and name in NAMES else None

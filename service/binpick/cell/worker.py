@@ -142,7 +142,7 @@ class Worker:
             cycle = self.run(inputs, lambda: self._proceed(ticket))
         finally:
             if self._counts(ticket):
-                self.gallery.keep(cycle, inputs.pair)
+                self.gallery.keep(inputs, cycle)
         times = {"acquire": (acquired_ns - ticket.started_ns) / 1e6, **cycle.result.timing_ms,
                  "total": (self.clock() - ticket.started_ns) / 1e6}
         return cycle.result.model_copy(update={"timing_ms": {name: round(ms, 3) for name, ms in times.items()}})
