@@ -149,7 +149,7 @@ def _line(picture: Picture, pixels: Float[np.ndarray, "n 2"], colour: Colour, th
     cv2.polylines(picture, [fixed.reshape(-1, 1, 2)], False, colour, thickness, cv2.LINE_AA, shift=4)
 
 
-def _captioned(picture: Picture, text: str, ground: Colour) -> Picture:
+def _captioned(picture: Picture, text: str, ground: Colour) -> UInt8[np.ndarray, "h2 w 3"]:
     """The picture under a strip with the text in it, as large as fits."""
     scale, thick = picture.shape[1] / 1000, max(1, round(picture.shape[1] / 800))
     width = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, scale, thick)[0][0]
@@ -161,7 +161,7 @@ def _captioned(picture: Picture, text: str, ground: Colour) -> Picture:
     return np.concatenate([strip, picture])
 
 
-def _blank(inputs: CycleInput, cycle: CycleResult) -> Picture:
+def _blank(inputs: CycleInput, cycle: CycleResult) -> UInt8[np.ndarray, "h w 3"]:
     """Nothing was measured, and the picture says so."""
     shape = inputs.pair.left.image.shape if cycle.rectified is None else (
         cycle.rectified.window.height, cycle.rectified.window.width)

@@ -1,7 +1,7 @@
 """All that a publisher knows of the cell: what it may read, and what it may ask for."""
 
 import asyncio
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from binpick.result import Artefact, Published, Request, Result, Snapshot
 
@@ -10,6 +10,7 @@ __all__ = ["Artefact", "Control", "Source", "View"]
 Source = Literal["modbus", "rest"]
 
 
+@runtime_checkable
 class View(Protocol):
     """Reading; every call returns at once with what is true now."""
 
@@ -41,6 +42,7 @@ class View(Protocol):
         ...
 
 
+@runtime_checkable
 class Control(Protocol):
     """Asking; refused with CycleRefused when the cell is busy, not ready, or owned by another interface."""
 
