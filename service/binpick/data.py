@@ -65,7 +65,10 @@ class StereoPair:
 
 @dataclass(frozen=True, slots=True)
 class CameraStatus:
-    """What a camera says of itself; `error` is empty when it is well."""
+    """What a camera says of itself; `error` is empty when it is well.
+
+    `clock` names the common clock its timestamps are in, such as "ptp"; empty: its own.
+    """
 
     name: str
     connected: bool
@@ -77,6 +80,7 @@ class CameraStatus:
     resends: int = 0
     error: str = ""
     simulated: bool = False
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True)

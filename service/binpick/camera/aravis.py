@@ -1,0 +1,321 @@
+"""A GigE Vision camera driven by Aravis, through GObject introspection; the only importer of gi.
+
+Aravis' traps that shape this module (0.8.26, measured): every call on a dead camera blocks 2.5 s; the socket's buffer is set
+only after a frame's first packets; AcquisitionStop and Start on one stream lose frames silently; the packet socket that root
+gets has another timing than production; a long exposure runs into the frame retention.
+"""
+
+import contextlib
+import functools
+import os
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from binpick.camera import probe
+from binpick.camera.base import MonotonicNs, remaining_s
+from binpick.camera.owner import Owner
+from binpick.data import CameraStatus, Frame, Light
+from binpick.errors import CameraError, CameraHeld, CameraLost, CameraNotFound, PairRefused
+
+T = TypeVar("T")
+BUFFERS = 6
+SOCKET_BUFFER_BYTES = 8 << 20
+"""Three whole frames; the kernel clips it to net.core.rmem_max."""
+PACKET_TIMEOUT_US = 5000
+"""When a missing packet is asked for again; Aravis' 20 ms dominates the latency of a lossy link."""
+RETENTION_US = 400_000
+"""How long an incomplete frame may wait for its packets, beyond the exposure."""
+POP_MARGIN_S = 0.02
+"""The driver gives up this much before its caller does, so that the thread is free again."""
+PROJECTOR_LINE = "Line2"
+"""The Alvium's opto-isolated output."""
+BLOCK_IDS = 0xFFFF
+"""GigE Vision 1 counts frames 1 to 65535 and again."""
+
+
+@functools.cache
+def _library() -> tuple[Any, Any]:
+    """Aravis and GLib, loaded at first use. Raises CameraError when the system packages are missing."""
+    try:
+        import gi
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis, GLib
+    except (ImportError, ValueError) as error:
+        raise CameraError("Aravis is not installed: apt-get install python3-gi gir1.2-aravis-0.8") from error
+    return Aravis, GLib
+
+
+class AravisCamera:
+    """One camera, by address (opened without discovery) or by serial number; with both, the serial is checked.
+
+    Its thread `binpick-cam-<name>` alone touches Aravis' objects. A verb that cannot end by its deadline raises CameraLost and
+    leaves that thread behind; the next `open` starts another.
+    """
+
+    def __init__(self, name: str, address: str, serial: str, packet_size: int = 1500, heartbeat_ms: int = 3000) -> None:
+        self._name = name
+        self._address = address
+        self._serial = serial
+        self._packet_size = packet_size
+        self._heartbeat_ms = heartbeat_ms
+        self._status = CameraStatus(name, connected=False, address=address, serial=serial)
+        self._driver: _Driver | None = None
+        self._owner: Owner | None = None
+        self._retired: Owner | None = None
+
+    @property
+    def name(self) -> str:
+        """As in every error."""
+        return self._name
+
+    def open(self, deadline_ns: MonotonicNs) -> None:
+        """Connects and starts the stream. Raises CameraNotFound, CameraHeld, CameraLost, CameraError."""
+        self.close()
+        if self._retired is not None:      # of a camera that lives, it needs milliseconds; of a dead one, seconds
+            self._retired.join(0.2)
+        driver = _Driver(self._name, self._packet_size, self._heartbeat_ms)
+        self._driver, self._owner = driver, Owner(f"binpick-cam-{self._name}", driver.close)
+        address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
+        if not probe.answers(address):
+            raise self._fail(CameraNotFound(f"camera {self._name}: no camera answers at {address}: check power, cable and the "
+                                            "address in the cell file", self._name))
+        facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
+        self._status = replace(self._status, connected=True, error="", address=address, **facts)
+
+    def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
+        """Exposure, gain, and whether the line that strobes the projector does so."""
+        driver = self._opened()
+        self._do("setting exposure and gain", lambda: driver.configure(light), deadline_ns)
+
+    def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002 - the frame's own affair in grab
+        """One software trigger."""
+        driver = self._opened()
+        self._do("triggering", driver.trigger, deadline_ns)
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+        """The frame of that trigger. Raises CameraLost when none comes, PairRefused when packets stayed away."""
+        driver = self._opened()
+        frame, clock = self._do("waiting for its image", lambda: driver.grab(sequence, deadline_ns), deadline_ns)
+        status = self._status
+        self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends, clock=clock)
+        return frame
+
+    def close(self) -> None:
+        """Gives the camera back; at most 0.9 s. A lost one is being closed already, and nobody waits for that."""
+        if self._owner is not None:
+            self._owner.retire()
+            self._owner.join(0.9)
+        self._owner = self._driver = None
+        self._status = replace(self._status, connected=False)
+
+    def status(self) -> CameraStatus:
+        """What the last verb left behind."""
+        return self._status
+
+    def _opened(self) -> "_Driver":
+        if self._driver is None:
+            raise CameraLost(f"camera {self._name} is not open", self._name)
+        return self._driver
+
+    def _do(self, what: str, function: Callable[[], T], deadline_ns: MonotonicNs) -> T:
+        if self._owner is None:
+            raise CameraLost(f"camera {self._name} is not open", self._name)
+        try:
+            return self._owner.call(function, deadline_ns)
+        except TimeoutError:
+            raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}", self._name)) from None
+        except CameraError as error:
+            raise self._fail(error) from None
+
+    def _fail(self, error: CameraError) -> CameraError:
+        """After an error the camera is closed; its thread does that in its own time."""
+        if self._owner is not None:
+            self._owner.retire()
+        self._retired, self._owner, self._driver = self._owner, None, None
+        self._status = replace(self._status, connected=False, error=str(error), failures=self._status.failures + 1)
+        return error
+
+
+class _Driver:
+    """Aravis' objects and what is done to them; lives on the camera's thread."""
+
+    def __init__(self, name: str, packet_size: int, heartbeat_ms: int) -> None:
+        self._name = name
+        self._packet_size = packet_size
+        self._heartbeat_ms = heartbeat_ms
+        self._camera: Any = None
+        self._stream: Any = None
+        self._exposure_us = self._gain_db = 0.0
+        self._triggers = 0
+        self._triggered_ns = 0
+        self._first_id = 1
+
+    def find(self, serial: str) -> str:
+        """The address of the camera with that serial number, by broadcast (1 s). Raises CameraNotFound."""
+        aravis, _ = _library()
+        aravis.update_device_list()
+        seen = {aravis.get_device_serial_nbr(i): str(aravis.get_device_address(i)) for i in range(aravis.get_n_devices())}
+        if serial not in seen:
+            raise CameraNotFound(f"camera {self._name}: no camera with serial number {serial!r} answers; there are "
+                                 f"{', '.join(sorted(map(str, seen))) or 'none'}", self._name)
+        return seen[serial]
+
+    def open(self, address: str, serial: str) -> dict[str, Any]:
+        """Control, settings, stream, acquisition, in the one order that works; what the status says of the camera."""
+        aravis, glib = _library()
+        try:
+            camera = self._camera = aravis.Camera.new(address)
+            if not camera.get_device().is_controller():
+                raise CameraHeld(f"camera {self._name} at {address} is controlled by another program: end that one (a program "
+                                 f"that died gives it back after its heartbeat timeout)", self._name)
+            found = str(camera.get_device_serial_number())
+            if serial and found != serial:
+                raise CameraNotFound(f"camera {self._name}: the camera at {address} has serial number {found}, not {serial}: "
+                                     "are the cameras exchanged?", self._name)
+            self._prepare(aravis, camera)
+            self._start_stream(aravis, camera)
+            firmware = str(camera.get_string("DeviceFirmwareVersion")) if self._has("DeviceFirmwareVersion") else ""
+            return {"model": str(camera.get_model_name()), "serial": found, "simulated": firmware.startswith("binpick-sim")}
+        except glib.Error as error:
+            raise self._translated(error, "opening") from None
+
+    def _has(self, feature: str) -> bool:
+        return bool(self._camera.is_feature_available(feature))
+
+    def _prepare(self, aravis: Any, camera: Any) -> None:
+        camera.stop_acquisition()                     # a controller that died may have left it running
+        camera.set_pixel_format(aravis.PIXEL_FORMAT_MONO_8)
+        camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
+        if camera.is_exposure_auto_available():
+            camera.set_exposure_time_auto(aravis.Auto.OFF)
+        if camera.is_gain_auto_available():
+            camera.set_gain_auto(aravis.Auto.OFF)
+        # not set_trigger(): it also writes the frame rate, which some cameras lock once a trigger is on
+        for feature, value in (("TriggerSelector", "FrameStart"), ("TriggerMode", "On"), ("TriggerSource", "Software")):
+            camera.set_string(feature, value)
+        camera.set_integer("GevHeartbeatTimeout", self._heartbeat_ms)
+        if self._has("PtpEnable"):
+            camera.set_boolean("PtpEnable", True)
+        camera.gv_set_packet_size(self._packet_size)
+        camera.gv_set_stream_options(aravis.GvStreamOption.PACKET_SOCKET_DISABLED)
+
+    def _start_stream(self, aravis: Any, camera: Any) -> None:
+        stream = self._stream = camera.create_stream(None, None)
+        stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.FIXED)
+        stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
+        stream.set_property("packet-timeout", PACKET_TIMEOUT_US)
+        stream.set_property("frame-retention", RETENTION_US)
+        _enlarge_socket_buffer(stream.get_port())
+        payload = camera.get_payload()
+        for _ in range(BUFFERS):
+            stream.push_buffer(aravis.Buffer.new_allocate(payload))
+        camera.start_acquisition()                    # and never stopped: block ids would start again
+
+    def configure(self, light: Light) -> None:
+        """Writes what the light asks for, reads back what the camera made of it."""
+        _, glib = _library()
+        camera = self._camera
+        try:
+            camera.set_exposure_time(light.exposure_us)
+            camera.set_gain(light.gain_db)
+            self._exposure_us, self._gain_db = float(camera.get_exposure_time()), float(camera.get_gain())
+            if self._has("LineSource"):
+                camera.set_string("LineSelector", PROJECTOR_LINE)
+                camera.set_string("LineSource", "ExposureActive" if light.projector else "Off")
+        except glib.Error as error:
+            raise self._translated(error, "setting exposure and gain") from None
+        self._stream.set_property("frame-retention", int(self._exposure_us) + RETENTION_US)
+
+    def trigger(self) -> None:
+        """Sends it; the camera's acknowledge has come when this returns."""
+        _, glib = _library()
+        self._triggers += 1
+        self._triggered_ns = time.monotonic_ns()
+        try:
+            self._camera.execute_command("TriggerSoftware")
+        except glib.Error as error:
+            raise self._translated(error, "triggering") from None
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> tuple[Frame, str]:
+        """The frame of the last trigger and the name of the clock it is stamped by; frames of older triggers are dropped."""
+        stream, resent, missing = self._stream, self._count("n_resent_packets"), self._count("n_missing_packets")
+        while True:
+            buffer = stream.timeout_pop_buffer(int(max(0.0, remaining_s(deadline_ns) - POP_MARGIN_S) * 1e6))
+            if buffer is None:
+                raise CameraLost(f"camera {self._name} took the trigger but sent no image", self._name)
+            try:
+                if self._behind(buffer.get_frame_id()) == 0:
+                    frame = self._frame(buffer, sequence, self._count("n_resent_packets") - resent,
+                                        self._count("n_missing_packets") - missing)
+                    return frame, self._clock()
+            finally:
+                stream.push_buffer(buffer)
+
+    def _behind(self, frame_id: int) -> int:
+        """How many triggers older than the last one a frame is; the first frame after opening says where counting starts."""
+        if self._triggers == 1:
+            self._first_id = frame_id
+        return (self._first_id + self._triggers - 1 - frame_id) % BLOCK_IDS
+
+    def _frame(self, buffer: Any, sequence: int, resends: int, missing: int) -> Frame:
+        aravis, _ = _library()
+        status = buffer.get_status()
+        if status != aravis.BufferStatus.SUCCESS:
+            raise PairRefused(f"camera {self._name}: the image came incomplete ({status.value_nick}, {missing} packets "
+                              "missing): check cable, network card and socket buffer", self._name)
+        height, width = buffer.get_image_height(), buffer.get_image_width()
+        # get_data() copies once; the bytes are the frame's own
+        image = np.frombuffer(buffer.get_data(), np.uint8, count=height * width).reshape(height, width)
+        return Frame(image=image, camera=self._name, sequence=sequence, frame_id=int(buffer.get_frame_id()),
+                     timestamp_ns=int(buffer.get_timestamp()), triggered_ns=self._triggered_ns,
+                     received_ns=time.monotonic_ns(), exposure_us=self._exposure_us, gain_db=self._gain_db,
+                     resends=resends, missing=missing)
+
+    def _count(self, name: str) -> int:
+        return int(self._stream.get_info_uint64_by_name(name))
+
+    def _clock(self) -> str:
+        """"ptp" while the camera is synchronised to other clocks; it may lose them at any time."""
+        _, glib = _library()
+        try:
+            synchronised = self._has("PtpStatus") and self._camera.get_string("PtpStatus") in ("Master", "Slave")
+        except glib.Error as error:
+            raise self._translated(error, "reading its clock") from None
+        return "ptp" if synchronised else ""
+
+    def _translated(self, error: Any, doing: str) -> CameraError:
+        aravis, _ = _library()
+        kind = aravis.DeviceError
+        if error.code in (kind.PROTOCOL_ERROR_ACCESS_DENIED, kind.NOT_CONTROLLER):
+            return CameraHeld(f"camera {self._name}: another program took control of it", self._name)
+        if error.code in (kind.FEATURE_NOT_FOUND, kind.WRONG_FEATURE, kind.INVALID_PARAMETER,
+                          kind.PROTOCOL_ERROR_INVALID_PARAMETER):
+            return CameraError(f"camera {self._name} does not accept {doing}: {error.message}", self._name)
+        return CameraLost(f"camera {self._name} failed while {doing}: {error.message}", self._name)
+
+    def close(self) -> None:
+        """Lets go of everything; on a dead camera that takes Aravis seconds."""
+        if self._camera is not None:
+            _, glib = _library()
+            with contextlib.suppress(glib.Error):     # a camera that is gone cannot be stopped
+                self._camera.stop_acquisition()
+        self._stream = None
+        self._camera = None
+
+
+def _enlarge_socket_buffer(port: int) -> None:
+    """Sets the stream socket's buffer now; Aravis would only do so inside the first frame, and lose it."""
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):            # not a socket, or closed by another thread meanwhile
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            with socket.socket(fileno=os.dup(int(entry.name))) as twin:
+                if twin.type == socket.SOCK_DGRAM and twin.family == socket.AF_INET and twin.getsockname()[1] == port:
+                    twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
