@@ -1,5 +1,7 @@
 """Pictures and the cloud of a finished cycle, for people: pure functions, drawn when somebody asks."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -27,10 +29,7 @@ def render(inputs: CycleInput, cycle: CycleResult, name: str) -> tuple[str, byte
     cloud.ply: measured points only, float32 x y z in metres, frame `camera`. overlay.png, disparity.png and confidence.png show
     the rectified left window. left.png and right.png are the images as taken. Raises KeyError for another name.
     """
-    draw = {"cloud.ply": _cloud, "overlay.png": _overlay, "disparity.png": _disparity, "confidence.png": _confidence,
-            "left.png": lambda inputs, _: _png(inputs.pair.left.image),
-            "right.png": lambda inputs, _: _png(inputs.pair.right.image)}[name]
-    return "image/png" if name.endswith(".png") else "application/octet-stream", draw(inputs, cycle)
+    return "image/png" if name.endswith(".png") else "application/octet-stream", DRAW[name](inputs, cycle)
 
 
 def ply(cloud: OrganisedCloud | None) -> bytes:
@@ -39,6 +38,14 @@ def ply(cloud: OrganisedCloud | None) -> bytes:
     header = ("ply\nformat binary_little_endian 1.0\ncomment binpick: measured points, metres, frame camera\n"
               f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\nend_header\n")
     return header.encode() + points.astype("<f4").tobytes()
+
+
+def _left(inputs: CycleInput, _cycle: CycleResult) -> bytes:
+    return _png(inputs.pair.left.image)
+
+
+def _right(inputs: CycleInput, _cycle: CycleResult) -> bytes:
+    return _png(inputs.pair.right.image)
 
 
 def _cloud(_inputs: CycleInput, cycle: CycleResult) -> bytes:
@@ -187,3 +194,8 @@ def _transform(pose: PoseMessage) -> Transform:
 def _png(picture: np.ndarray) -> bytes:
     """Level 1: a third of the time for a tenth more bytes than OpenCV's own choice."""
     return cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+DRAW: dict[str, Callable[[CycleInput, CycleResult], bytes]] = {
+    "cloud.ply": _cloud, "overlay.png": _overlay, "disparity.png": _disparity, "confidence.png": _confidence,
+    "left.png": _left, "right.png": _right}

@@ -5,39 +5,41 @@ from collections.abc import AsyncIterator
 from fastapi import APIRouter, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from binpick.data import CameraStatus
+from binpick.health import Health
 from binpick.metrics import MEDIA_TYPE
-from binpick.publish import events, wire
+from binpick.publish import events
 from binpick.publish.wiring import Reach
 
 router = APIRouter(tags=["status"])
 
 
 @router.get("/v1/health")
-async def health(ports: Reach) -> wire.HealthMessage:
+async def health(ports: Reach) -> Health:
     """Whether the cell is well, and if not why; always 200."""
-    return wire.HealthMessage.of(ports.health())
+    return ports.health()
 
 
-@router.get("/v1/health/live", responses={503: {"model": wire.HealthMessage, "description": "Restart the daemon."}})
-async def live(ports: Reach, response: Response) -> wire.HealthMessage:
+@router.get("/v1/health/live", responses={503: {"model": Health, "description": "Restart the daemon."}})
+async def live(ports: Reach, response: Response) -> Health:
     """200 while the daemon works at all, else 503."""
     state = ports.health()
     response.status_code = 200 if state.live else 503
-    return wire.HealthMessage.of(state)
+    return state
 
 
-@router.get("/v1/health/ready", responses={503: {"model": wire.HealthMessage, "description": "No cycle can start now."}})
-async def ready(ports: Reach, response: Response) -> wire.HealthMessage:
+@router.get("/v1/health/ready", responses={503: {"model": Health, "description": "No cycle can start now."}})
+async def ready(ports: Reach, response: Response) -> Health:
     """200 when a cycle would start now or runs, else 503."""
     state = ports.health()
     response.status_code = 200 if state.ready else 503
-    return wire.HealthMessage.of(state)
+    return state
 
 
 @router.get("/v1/cameras")
-async def cameras(ports: Reach) -> tuple[wire.CameraMessage, ...]:
+async def cameras(ports: Reach) -> tuple[CameraStatus, ...]:
     """What each camera says of itself."""
-    return tuple(wire.CameraMessage.of(status) for status in ports.view.snapshot().cameras)
+    return ports.view.snapshot().cameras
 
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}})

@@ -1,12 +1,10 @@
 """The messages of REST that are not a result: what goes in, and the state that comes out."""
 
-from dataclasses import asdict
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from binpick.data import CameraStatus
-from binpick.health import Health
 from binpick.result import Published, Snapshot, Wire
 
 NS_PER_MS = 1_000_000
@@ -27,26 +25,6 @@ class Accepted(Wire):
     phase: Literal["acquiring", "computing"]
 
 
-class CameraMessage(Wire):
-    """What a camera says of itself; `error` is empty when it is well."""
-
-    name: str
-    connected: bool
-    model: str
-    serial: str
-    address: str
-    frames: int
-    failures: int
-    resends: int
-    error: str
-    simulated: bool
-
-    @classmethod
-    def of(cls, status: CameraStatus) -> "CameraMessage":
-        """The same as a message."""
-        return cls(**asdict(status))
-
-
 class State(Wire):
     """The cell at one instant, as /v1/events tells it."""
 
@@ -65,7 +43,7 @@ class State(Wire):
     owner: Literal["modbus", "rest", "none"]
     simulated: bool
     faults: tuple[str, ...]
-    cameras: tuple[CameraMessage, ...]
+    cameras: tuple[CameraStatus, ...]
     counts: dict[str, int]
 
     @classmethod
@@ -75,21 +53,7 @@ class State(Wire):
             boot_id=snapshot.boot_id, phase=snapshot.phase, cycle_id=snapshot.current, acquired=snapshot.acquired,
             latest=snapshot.latest.result.cycle_id if snapshot.latest else 0, valid=snapshot.valid,
             withdrawn=snapshot.withdrawn, owner=snapshot.owner, simulated=snapshot.simulated, faults=snapshot.faults,
-            cameras=tuple(CameraMessage.of(status) for status in snapshot.cameras), counts=dict(snapshot.counts))
-
-
-class HealthMessage(Wire):
-    """Whether the cell is well, and if not why."""
-
-    status: Literal["ok", "degraded", "fault"]
-    live: bool
-    ready: bool
-    reasons: tuple[str, ...]
-
-    @classmethod
-    def of(cls, health: Health) -> "HealthMessage":
-        """The same as a message."""
-        return cls(status=health.status, live=health.live, ready=health.ready, reasons=health.reasons)
+            cameras=snapshot.cameras, counts=dict(snapshot.counts))
 
 
 def age_ms(published: Published, now_ns: int) -> float | None:
