@@ -101,7 +101,7 @@ class Cell:
 
     def launch(self) -> asyncio.Task[None]:
         """Starts the worker thread, and the supervisor on the running loop, which ends only by `close` or by a defect."""
-        self._supervisor = asyncio.get_running_loop().create_task(self._supervise(), name="binpick-supervisor")
+        self._supervisor = asyncio.get_running_loop().create_task(self._supervise(), name="the cell's supervisor")
         self._thread.start()
         return self._supervisor
 

@@ -1,0 +1,252 @@
+"""The composition root: settings become cameras, a cell and its servers; the only asyncio.run and the only signal handlers.
+
+Everything stops in the reverse order of its start (DESIGN §5a): READY falls and waiters end, the cell gives the cameras back,
+the servers close, the recorder empties its queue. A driver stuck in C cannot hold the exit.
+"""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import uvicorn
+
+from binpick import health, recording, settings
+from binpick import rig as rig_file
+from binpick.cell import Cameras, Cell
+from binpick.data import CameraStatus
+from binpick.errors import InputError, PortInUse
+from binpick.recording import Recorder
+from binpick.rig import Rig
+
+STOP_LIMIT_S = 2.8
+"""From the first signal to exit (contract: 3 s); what has not ended by then is abandoned."""
+RECORDER_LIMIT_S = 0.5
+MODBUS_PORT = 502
+"""The port robots look at: simulated results never appear there."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where a running daemon is reached; `modbus` is None when the cell file has none."""
+
+    rest: str
+    page: str
+    modbus: tuple[str, int] | None
+
+    def sentence(self) -> str:
+        """The line a person sees."""
+        modbus = f", Modbus/TCP {self.modbus[0]}:{self.modbus[1]}" if self.modbus else ""
+        return f"binpick is up: page {self.page}, REST {self.rest}/v1{modbus}"
+
+
+Work = Callable[[Addresses], Awaitable[int]]
+"""What runs beside the daemon and ends it with an exit code."""
+
+
+def run_file(path: Path) -> int:
+    """Runs the cell of a file until a signal; returns the exit code. Raises the faults of errors.py that stop a start."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _quit)  # until the loop has its own: a stop while libraries load is no traceback
+    cell = settings.load(path)
+    rig, warnings = rig_file.load(cell.rig)
+    for warning in warnings:
+        log.warning(warning)
+    return run(cell, rig, cameras(cell))
+
+
+def cameras(cell: settings.Cell) -> Cameras:
+    """The cell file's cameras as a group, not yet open."""
+    from binpick.camera import backends
+    from binpick.camera.group import CameraGroup
+
+    return CameraGroup(backends.make(cell.cameras), cell.cameras.max_skew_us)
+
+
+def run(cell: settings.Cell, rig: Rig, cameras: Cameras, work: Work | None = None) -> int:
+    """Runs a daemon over these cameras until a signal, or until `work` ends; returns the exit code.
+
+    Raises PortInUse; InputError when simulated cameras would be served on Modbus port 502.
+    """
+    watchdog = threading.Timer(STOP_LIMIT_S, _abandon)
+    watchdog.name, watchdog.daemon = "binpick-stop", True
+    try:
+        return asyncio.run(_main(cell, rig, cameras, work, watchdog))
+    finally:
+        watchdog.cancel()
+
+
+async def _main(cell: settings.Cell, rig: Rig, cameras: Cameras, work: Work | None, watchdog: threading.Timer) -> int:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, _signalled, stop, number)
+    async with _serving(cell, rig, cameras) as (addresses, vital):
+        sys.stdout.write(addresses.sentence() + "\n")
+        sys.stdout.flush()
+        code = await _until(stop, vital, work(addresses) if work else None)
+        watchdog.start()
+        log.info("stopping")
+    return code
+
+
+def _signalled(stop: asyncio.Event, number: int) -> None:
+    if stop.is_set():  # the second one: at once, whatever is left
+        os._exit(128 + number)
+    stop.set()
+
+
+async def _until(stop: asyncio.Event, vital: set[asyncio.Task[Any]], work: Awaitable[int] | None) -> int:
+    """Waits for the signal (0), the work (its code), or the end of something that should never end (raises why)."""
+    ends: set[asyncio.Future[Any]] = {asyncio.ensure_future(stop.wait())}
+    working = asyncio.ensure_future(work) if work is not None else None
+    if working is not None:
+        ends.add(working)
+    try:
+        await asyncio.wait(ends | vital, return_when=asyncio.FIRST_COMPLETED)
+        for task in vital:
+            if task.done():
+                task.result()
+                raise RuntimeError(f"{task.get_name()} ended by itself")
+        return working.result() if working is not None and working.done() else 0
+    finally:
+        for end in ends:
+            end.cancel()
+        await asyncio.gather(*ends, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def _serving(cell: settings.Cell, rig: Rig, cameras: Cameras,
+                   ) -> AsyncIterator[tuple[Addresses, set[asyncio.Task[Any]]]]:
+    """The daemon while it runs, and the tasks that must not end."""
+    from binpick.publish import rest
+
+    refuse_simulation_on_502(cell, cameras.statuses())
+    with _recording(cell) as recorder:
+        living = Cell(cell, rig, cameras, boot_id=secrets.randbelow(65535) + 1, recorder=recorder)
+
+        def judged() -> health.Health:
+            return health.judge(living.snapshot(), alive=living.alive, recording=recorder.status().trouble if recorder else "")
+
+        listener = listen(cell.publish.rest.host, cell.publish.rest.port, "publish.rest")
+        api = rest.create_app(living, living, health=judged)
+        async with _modbus(cell, living) as registers, _http(api, listener) as pages:
+            guard = asyncio.create_task(_watch_simulation(cell, living), name="the guard of port 502")
+            try:
+                yield _addresses(cell), {*registers, pages, living.launch(), guard}
+            finally:
+                guard.cancel()
+                await living.close()
+
+
+@contextlib.contextmanager
+def _recording(cell: settings.Cell) -> Iterator[Recorder | None]:
+    if cell.recording.directory is None:
+        yield None
+        return
+    recorder = recording.Recorder(cell.recording.directory)
+    recorder.start()
+    try:
+        yield recorder
+    finally:
+        if not recorder.close(RECORDER_LIMIT_S):
+            log.warning("recordings of the last cycles were abandoned: the disk is too slow")
+
+
+@contextlib.asynccontextmanager
+async def _modbus(cell: settings.Cell, living: Cell) -> AsyncIterator[set[asyncio.Task[Any]]]:
+    if cell.publish.modbus is None:
+        yield set()
+        return
+    from binpick.publish.modbus import ModbusServer
+
+    server = ModbusServer(living, living, cell.publish.modbus, cell)
+    task = await server.start()
+    try:
+        yield {task}
+    finally:
+        await server.stop()
+
+
+class _Server(uvicorn.Server):
+    """uvicorn without its signal handling, which loses `finally` on SIGTERM and hangs on an open SSE client."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Ours are installed already."""
+        yield
+
+
+@contextlib.asynccontextmanager
+async def _http(api: Any, listener: socket.socket) -> AsyncIterator[asyncio.Task[None]]:
+    server = _Server(uvicorn.Config(api, log_config=None, access_log=False, timeout_graceful_shutdown=2))
+    task = asyncio.create_task(server.serve(sockets=[listener]), name="the HTTP server")
+    try:
+        while not server.started and not task.done():
+            await asyncio.sleep(0.005)
+        yield task
+    finally:
+        server.should_exit = True
+        await task
+
+
+def listen(host: str, port: int, key: str) -> socket.socket:
+    """A listening TCP socket; `key` names the setting. Raises PortInUse, InputError."""
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        what = {errno.EADDRINUSE: "another program listens there: stop it, or choose another port",
+                errno.EACCES: "ports below 1024 need the capability CAP_NET_BIND_SERVICE: grant it, or choose another port",
+                errno.EADDRNOTAVAIL: "this machine has no such address: use one of its own, or 0.0.0.0 for all"}
+        kind = PortInUse if error.errno == errno.EADDRINUSE else InputError
+        raise kind(f"{key}: cannot listen on {host}:{port}: {what.get(error.errno or 0, error.strerror)}") from error
+
+
+def _addresses(cell: settings.Cell) -> Addresses:
+    """0.0.0.0 is no address to go to: people are shown this machine's own."""
+    rest, modbus = cell.publish.rest, cell.publish.modbus
+    host = "127.0.0.1" if rest.host in ("0.0.0.0", "::") else rest.host
+    base = f"http://{f'[{host}]' if ':' in host else host}:{rest.port}"
+    return Addresses(base, f"{base}/ui", (modbus.host, modbus.port) if modbus else None)
+
+
+def refuse_simulation_on_502(cell: settings.Cell, cameras: tuple[CameraStatus, ...]) -> None:
+    """Raises InputError when a robot could take poses of a simulated scene for real ones."""
+    if cell.publish.modbus is not None and cell.publish.modbus.port == MODBUS_PORT:
+        for status in cameras:
+            if status.simulated:
+                raise InputError(f"camera {status.name} is simulated, and simulated poses are never served on Modbus port "
+                                 f"{MODBUS_PORT}: set publish.modbus.port, for instance to 5020")
+
+
+async def _watch_simulation(cell: settings.Cell, living: Cell) -> NoReturn:
+    """Some cameras are known to be simulated only once they are open."""
+    changed = living.subscribe()
+    try:
+        while True:
+            changed.clear()
+            refuse_simulation_on_502(cell, living.snapshot().cameras)
+            await changed.wait()
+    finally:
+        living.unsubscribe(changed)
+
+
+def _quit(_number: int, _frame: object) -> NoReturn:
+    raise SystemExit(0)
+
+
+def _abandon() -> None:
+    log.warning("not everything ended within %.1f s; it is abandoned", STOP_LIMIT_S)
+    logging.shutdown()
+    os._exit(0)

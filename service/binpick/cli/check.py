@@ -1,0 +1,150 @@
+"""`binpick check`: what stands between this cell file and a running cell."""
+
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+if TYPE_CHECKING:
+    from binpick.cell import Cameras
+    from binpick.rig import Rig
+    from binpick.settings import Bin, Cell, Recipe, Tool
+
+CAMERA_LIMIT_S = 10.0
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at; `fault` is empty when it is well, and `exit_code` says what kind of fault."""
+
+    what: str
+    seen: str
+    fault: str = ""
+    exit_code: int = 0
+
+
+def check(
+    cell: Annotated[Path, typer.Option(help="Cell file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Look at everything `run` needs: cell file, rig, free ports, cameras and one pair of images.
+
+    Exit code 0: all is well. 2: a file or a setting is wrong. 3: a camera does not answer.
+    """
+    found = list(findings(cell))
+    if as_json:
+        typer.echo(json.dumps([finding._asdict() for finding in found], indent=1))
+    else:
+        _tell(found)
+    raise typer.Exit(max(finding.exit_code for finding in found))
+
+
+def findings(path: Path) -> Iterator[Finding]:
+    """Looks at one thing after the other; what rests on a broken one is left out."""
+    from binpick import app, settings
+    from binpick import rig as rig_file
+    from binpick.errors import BinpickError
+
+    try:
+        cell = settings.load(path)
+        yield Finding("cell file", f"{path}: bins {_numbers(cell.bins)}, tools {_numbers(cell.tools)}, recipes "
+                                    f"{_numbers(cell.recipes)}, controlled by {cell.control}")
+    except BinpickError as error:
+        yield Finding("cell file", str(path), str(error), error.exit_code)
+        return
+    yield from _ports(cell)
+    try:
+        rig, warnings = rig_file.load(cell.rig)
+        yield Finding("rig", "; ".join([f"{cell.rig}: {' and '.join(c.name for c in rig.cameras)}", *warnings]))
+    except BinpickError as error:
+        yield Finding("rig", str(cell.rig), str(error), error.exit_code)
+        return
+    for recipe in cell.recipes:
+        yield _tried(f"recipe {recipe.number}", partial(_recipe, cell, rig, recipe.number))
+    cameras = app.cameras(cell)
+    try:
+        opened = _tried("cameras", partial(_open, cell, cameras))
+        yield opened
+        if not opened.fault:
+            yield _tried("a pair of images", partial(_capture, cell, rig, cameras))
+    finally:
+        cameras.close()
+
+
+def _numbers(items: "Iterable[Bin | Tool | Recipe]") -> str:
+    return " ".join(str(item.number) for item in items)
+
+
+def _tried(what: str, look: Callable[[], str]) -> Finding:
+    from binpick.errors import BinpickError
+
+    try:
+        return Finding(what, look())
+    except BinpickError as error:
+        return Finding(what, "", str(error), error.exit_code)
+
+
+def _ports(cell: "Cell") -> Iterator[Finding]:
+    for key, server in (("publish.rest", cell.publish.rest), ("publish.modbus", cell.publish.modbus)):
+        if server is not None:
+            yield _tried(key, partial(_free, server.host, server.port, key))
+
+
+def _free(host: str, port: int, key: str) -> str:
+    from binpick import app
+
+    app.listen(host, port, key).close()
+    return f"{host}:{port} is free"
+
+
+def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:
+    from binpick import pipeline, settings
+    from binpick.errors import FlangePoseMissing
+    from binpick.result import Request
+
+    job = settings.resolve(cell, number)
+    seen = f"{job.recipe.name}: bin {job.bin.number}, tool {job.tool.number}, poses in {job.recipe.frame}"
+    try:
+        pipeline.admit(rig, job, Request())
+    except FlangePoseMissing:
+        return f"{seen}; every request must carry T_base_flange"
+    return seen
+
+
+def _open(cell: "Cell", cameras: "Cameras") -> str:
+    from binpick import app
+
+    cameras.open(time.monotonic_ns() + int(CAMERA_LIMIT_S * 1e9))
+    app.refuse_simulation_on_502(cell, cameras.statuses())
+    return ", ".join(f"{c.name} {c.model} {c.serial} {c.address}".strip() for c in cameras.statuses())
+
+
+def _capture(cell: "Cell", rig: "Rig", cameras: "Cameras") -> str:
+    from binpick.data import Light
+    from binpick.errors import ImageError
+
+    recipe = cell.recipes[0]
+    pair = cameras.capture(Light(recipe.exposure_us, recipe.gain_db, recipe.projector),
+                           time.monotonic_ns() + int(CAMERA_LIMIT_S * 1e9))
+    width, height = rig.image_size_px
+    for frame in (pair.left, pair.right):
+        if frame.image.shape != (height, width):
+            given = f"{frame.image.shape[1]}x{frame.image.shape[0]}"
+            raise ImageError(f"camera {frame.camera} gives {given} pixels and the rig was calibrated with {width}x{height}: "
+                             "set the camera back, or calibrate again")
+    return f"{width}x{height}, mean grey {pair.left.image.mean():.0f} and {pair.right.image.mean():.0f} of 255"
+
+
+def _tell(found: list[Finding]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for title in ("", "what", "found"):
+        table.add_column(title, overflow="fold")
+    for finding in found:
+        table.add_row("[red]FAIL[/]" if finding.fault else "[green]ok[/]", finding.what, finding.fault or finding.seen)
+    Console().print(table)
