@@ -110,7 +110,7 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, inputs: C
     """The best grasps whose tool touches nothing, in order, with their clearance."""
     job, wanted = inputs.job, inputs.request.max_grasps or inputs.job.recipe.max_grasps
     sieve = clearance.blocked(found, job.tool, heights)
-    ordered = rank.rank([g for g, hit in zip(found, sieve, strict=True) if not hit], segments, heights, job.tool)
+    ordered = rank.rank([g for g, hit in zip(found, sieve, strict=True) if not hit], segments, job.tool)
     scene = clearance.obstacles(heights, job.bin)
     kept: list[Grasp] = []
     collide = int(sieve.sum())
@@ -206,14 +206,7 @@ class _Frames:
 
     @classmethod
     def of(cls, inputs: CycleInput) -> "_Frames":
-        rig, flange = inputs.rig, inputs.request.T_base_flange
-        T_base_camera = None
-        if rig.T_base_rig is not None:
-            T_base_camera = np.array(rig.T_base_rig)
-        elif rig.T_flange_rig is not None and flange is not None:
-            T_base_flange = geometry.from_quaternion(np.array(flange.position_m), np.array(flange.quaternion_xyzw))
-            T_base_camera = T_base_flange @ np.array(rig.T_flange_rig)
-        return cls(load_carrier.place(inputs.job.bin, T_base_camera), T_base_camera)
+        return cls(load_carrier.place(inputs.job.bin, inputs.T_base_camera), inputs.T_base_camera)
 
     def T_frame_bin(self, frame: FrameName) -> Transform:
         """Maps bin coordinates to the frame of that name; `admit` has proved that it exists."""

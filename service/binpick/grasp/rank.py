@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from binpick.data import Grasp, HeightMap, Segments
+from binpick.data import Grasp, Segments
 from binpick.settings import Tool
 
 WEIGHTS = {"height": 0.30, "seal": 0.30, "area": 0.15, "upright": 0.15, "centre": 0.10}
@@ -15,19 +15,19 @@ PER_PART = 2
 """At most this many grasps of one part."""
 
 
-def rank(grasps: list[Grasp], segments: Segments, heights: HeightMap, tool: Tool) -> list[Grasp]:
+def rank(grasps: list[Grasp], segments: Segments, tool: Tool) -> list[Grasp]:
     """Best first, with qualities, without near-duplicates, at most two per part."""
     labels, counts = np.unique(segments.parts[segments.parts > 0], return_counts=True)
     area_px = dict(zip(labels.tolist(), counts.tolist(), strict=True))
     centre = {label: segments.xyz[segments.parts == label].mean(axis=0) for label in segments.part_confidence}
     largest = max(area_px.values(), default=1)
-    top = float(np.nanmax(heights.height, initial=1e-3))
+    top = max((float(g.T_bin_tcp[2, 3]) for g in grasps), default=0.0)
     scored = []
     for grasp in grasps:
         offset = float(np.linalg.norm(grasp.T_bin_tcp[:3, 3] - centre[grasp.part_id]))
         tilt = float(np.arccos(np.clip(-grasp.T_bin_tcp[2, 2], -1, 1)))
         terms = {
-            "height": float(np.clip(grasp.T_bin_tcp[2, 3] / top, 0, 1)),
+            "height": float(np.clip(grasp.T_bin_tcp[2, 3] / max(top, 1e-3), 0, 1)),
             "seal": float(np.clip(1 - grasp.seal_rms_m / tool.compliance_m, 0, 1)),
             "area": float(np.sqrt(area_px[grasp.part_id] / largest)),
             "upright": 1 - tilt / max(tool.max_tilt_rad, 1e-6) if tool.max_tilt_rad else 1.0,
@@ -40,7 +40,7 @@ def rank(grasps: list[Grasp], segments: Segments, heights: HeightMap, tool: Tool
 
 def _key(grasp: Grasp) -> tuple[float, ...]:
     """Quality to 0.001, then height, x, y to 1 mm: noise in the last bits cannot swap two grasps."""
-    x, y, z = (round(float(v) * 1000) for v in grasp.T_bin_tcp[:3, 3])
+    x, y, z = np.round(grasp.T_bin_tcp[:3, 3], 3).tolist()
     return (-grasp.quality, -z, x, y, *np.round(grasp.T_bin_tcp[:3, 2], 2).tolist())
 
 

@@ -196,5 +196,5 @@ def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Se
     independent = max(1.0, float(seal.support[i]) / CORRELATED_PX)
     radius_m = tool.cups[0].radius_m
     return Grasp(T_bin_tcp=T_bin_tcp, tool=tool.number, part_id=part, open_m=0.0, close_m=0.0, quality=0.0,
-                 seal_rms_m=float(seal.rms_m[i]), sigma_xy_m=sigma_px_m / 2, sigma_z_m=sigma_px_m / np.sqrt(independent),
+                 seal_rms_m=float(seal.rms_m[i]), sigma_xy_m=sigma_px_m / 2, sigma_z_m=float(sigma_px_m / np.sqrt(independent)),
                  sigma_tilt_rad=float(2 * sigma_px_m / radius_m / np.sqrt(independent)))

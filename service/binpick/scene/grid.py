@@ -17,7 +17,7 @@ STEP_M = 0.012
 SIGMAS = 4.0
 """A jump is larger than this many sigma of depth."""
 
-Cut = Bool[np.ndarray, "h w"]
+Cut = Bool[np.ndarray, "links_h links_w"]
 
 
 def segment(surface: Surface, of_interest: Mask, settings: SegmentSettings) -> tuple[Labels, Labels]:
@@ -51,7 +51,7 @@ def _dot(a: Cloud, b: Cloud) -> Float32[np.ndarray, "h w"]:
     return product
 
 
-def _components(nodes: Mask, right: Cut, down: Cut) -> Labels:
+def _components(nodes: Mask, right: Bool[np.ndarray, "h w-1"], down: Bool[np.ndarray, "h-1 w"]) -> Labels:
     """Connected components of a grid graph, by OpenCV on a grid of twice the size where every link is a pixel of its own."""
     rows, cols = nodes.shape
     fine = np.zeros((2 * rows - 1, 2 * cols - 1), dtype=np.uint8)

@@ -1,12 +1,13 @@
 """The cell file (cell.yaml): every field has a unit, bounds and a sentence; unknown keys are errors."""
 
-from binpick.settings.cell import Cell
+from binpick.settings.cell import AravisCameras, CameraAddress, Cell, FileCameras, ModbusSettings, Publish, RestSettings
 from binpick.settings.file import load, parse, schema
 from binpick.settings.job import Job, resolve
 from binpick.settings.recipe import Bin, Limits, PartSize, Pose, Reach, Recipe, SegmentSettings, StereoSettings
 from binpick.settings.tool import Body, Box, Cup, Cylinder, Tool, Wrist
 
 __all__ = [
-    "Bin", "Body", "Box", "Cell", "Cup", "Cylinder", "Job", "Limits", "PartSize", "Pose", "Reach", "Recipe", "SegmentSettings",
-    "StereoSettings", "Tool", "Wrist", "load", "parse", "resolve", "schema",
+    "AravisCameras", "Bin", "Body", "Box", "CameraAddress", "Cell", "Cup", "Cylinder", "FileCameras", "Job", "Limits",
+    "ModbusSettings", "PartSize", "Pose", "Publish", "Reach", "Recipe", "RestSettings", "SegmentSettings", "StereoSettings",
+    "Tool", "Wrist", "load", "parse", "resolve", "schema",
 ]

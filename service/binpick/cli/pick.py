@@ -1,0 +1,105 @@
+"""`binpick pick`: one cycle on two images from disk, or on a recording."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from binpick.result import CycleInput, CycleResult, Request
+    from binpick.rig import Rig
+    from binpick.settings import Cell
+
+PICTURES = ("cloud.ply", "overlay.png")
+
+
+def pick(
+    left: Annotated[Path, typer.Option(help="Left image, 8-bit grey, as the camera gave it.")],
+    right: Annotated[Path, typer.Option(help="Right image of the same instant.")],
+    rig: Annotated[Path, typer.Option(help="Rig file of these cameras.")],
+    cell: Annotated[Path, typer.Option(help="Cell file: bin, tool, recipe.")],
+    out: Annotated[Path, typer.Option(help="Folder for result.json, cloud.ply and overlay.png.")],
+    recipe: Annotated[int, typer.Option(help="Recipe number; 0: the first.", min=0, max=65535)] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result instead of a summary.")] = False,
+) -> None:
+    """Find grasps in one stereo pair.
+
+    Images that belong to a recording (input.json beside them) run with its request and cycle number, and give its result
+    byte for byte, times aside. Exit code 1: the scene says no; the return code says why.
+    """
+    from binpick import artefacts, pipeline, settings
+    from binpick import rig as rig_file
+    from binpick.result import Request
+
+    loaded_rig, warnings = rig_file.load(rig)
+    for warning in warnings:
+        typer.echo(warning, err=True)
+    inputs = _inputs(left, right, loaded_rig, settings.load(cell), Request(recipe=recipe))
+    outcome = pipeline.run(inputs)
+    write(out, {"result.json": outcome.result.json_bytes(),
+                 **{name: artefacts.render(inputs, outcome, name)[1] for name in PICTURES}})
+    if as_json:
+        typer.echo(outcome.result.json_bytes().decode(), nl=False)
+    else:
+        _tell(outcome, out)
+    if not outcome.result.return_code.code.carries_poses:
+        raise typer.Exit(1)
+
+
+def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request") -> "CycleInput":
+    """The cycle of two images; of a recording when they belong to one."""
+    import time
+
+    from binpick import recording, settings
+    from binpick.camera import backends
+    from binpick.camera.group import CameraGroup
+    from binpick.data import Light
+    from binpick.result import CycleInput
+
+    job = settings.resolve(cell, request.recipe)
+    if (left.parent / "input.json").is_file() and (left.name, right) == ("left.png", left.parent / "right.png"):
+        typer.echo(f"{left.parent} is a recording: its cycle and request are used", err=True)
+        recorded, _ = recording.load(left.parent)
+        job = settings.resolve(cell, request.recipe or recorded.request.recipe, recorded.request.bin, recorded.request.tool)
+        return replace(recorded, rig=rig, job=job)
+    cameras = CameraGroup(backends.make(settings.FileCameras(backend="files", left=left, right=right)), max_skew_us=1e6)
+    deadline_ns = time.monotonic_ns() + 10_000_000_000
+    cameras.open(deadline_ns)
+    try:
+        pair = cameras.capture(Light(job.recipe.exposure_us, job.recipe.gain_db, job.recipe.projector), deadline_ns)
+    finally:
+        cameras.close()
+    return CycleInput(cycle_id=1, pair=pair, rig=rig, job=job, request=request, simulated=False)
+
+
+def write(folder: Path, files: dict[str, bytes]) -> None:
+    """Writes the files of a command. Raises InputError when the folder cannot be written."""
+    from binpick.errors import InputError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, body in files.items():
+            (folder / name).write_bytes(body)
+    except OSError as error:
+        raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
+
+
+def _tell(outcome: "CycleResult", out: Path) -> None:
+    """The summary for people: the outcome, the grasps, and why no more."""
+    from rich.console import Console
+    from rich.table import Table
+
+    result, console = outcome.result, Console()
+    console.print(f"{result.return_code.value} {result.return_code.name}: {result.return_code.message}")
+    if result.grasps:
+        table = Table("rank", "x mm", "y mm", "z mm", "quality", "clearance mm", "σz mm",
+                      title=f"Grasps in frame {result.grasps[0].frame}")
+        for grasp in result.grasps:
+            x, y, z = (f"{1000 * value:.1f}" for value in grasp.position_m)
+            table.add_row(str(grasp.rank), x, y, z, f"{grasp.quality:.2f}", f"{1000 * grasp.clearance_m:.1f}",
+                          f"{1000 * grasp.sigma.z_m:.2f}")
+        console.print(table)
+    if result.funnel is not None:
+        console.print("  ".join(f"{name} {count}" for name, count in result.funnel.counts.items()))
+    console.print(f"{result.timing_ms.get('compute', 0):.0f} ms; written to {out}")

@@ -1,0 +1,127 @@
+"""Planted boxes: suction finds the faces, clearance the obstacles, the gate what must not leave."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from binpick import geometry
+from binpick.grasp import clearance, gate, rank, suction
+from binpick.result import GraspMessage, PoseMessage, Sigma, ToolMessage
+from binpick.scene import heightmap, segment
+from binpick.scene.surface import surface
+from binpick.stereo import cloud
+
+
+def found(planted):
+    points = cloud.reproject(planted.depth, planted.rectified)
+    heights = heightmap.height_map(geometry.transform(planted.T_bin_camera, points.xyz), planted.job.bin)
+    grid = surface(planted.depth, planted.rectified, planted.T_bin_camera)
+    segments = segment.segment(grid, planted.job.bin, planted.job.recipe.part, planted.job.recipe.segment)
+    grasps, counts = suction.candidates(segments, planted.job.tool, grid.sigma_z_m)
+    return heights, segments, grasps, counts
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_a_face_is_grasped_on_its_surface_along_its_normal(plant, slab, tilt):
+    planted = plant([slab(0.02, 0.01, 0.06, 0.04, 0.05, tilt)], noise_px=0.15)
+    heights, segments, grasps, _ = found(planted)
+    best = rank.rank(grasps, segments, planted.job.tool)[0]
+    normal = np.array([0, -np.sin(tilt), np.cos(tilt)])
+    assert np.degrees(np.arccos(-best.T_bin_tcp[:3, 2] @ normal)) < 3
+    assert abs((best.T_bin_tcp[:3, 3] - [0.02, 0.01, 0.05]) @ normal) < 0.0006
+    assert geometry.is_rigid(best.T_bin_tcp)
+    # x lies along the long extent
+    assert abs(best.T_bin_tcp[0, 0]) > 0.95
+
+
+def test_a_face_narrower_than_the_cup_is_not_offered(plant, slab):
+    _, _, grasps, counts = found(plant([slab(0, 0, 0.06, 0.010, 0.05)], noise_px=0.1))
+    assert not grasps
+    assert counts["rim_not_on_one_part"] > 0
+
+
+def test_a_face_too_steep_is_not_offered(plant, slab):
+    planted = plant([slab(0, 0, 0.06, 0.06, 0.06, 0.75)], noise_px=0.1)
+    _, _, grasps, counts = found(planted)
+    assert not grasps
+    assert counts["tilt"] > 0
+
+
+def test_a_free_part_is_clear_and_a_part_in_a_shaft_is_not(plant, slab):
+    free = plant([slab(0, 0, 0.06, 0.04, 0.02)])
+    heights, segments, grasps, _ = found(free)
+    best = rank.rank(grasps, segments, free.job.tool)[0]
+    # its own face beside the foot is the nearest thing
+    assert clearance.clearance(best, free.job.tool, clearance.obstacles(heights, free.job.bin)) > 0.004
+    walls = [slab(x, y, 0.02, 0.10, 0.095) for x, y in ((-0.021, 0), (0.021, 0))]
+    shaft = plant([slab(0, 0, 0.022, 0.06, 0.02), *walls])
+    heights, segments, grasps, _ = found(shaft)
+    deep = [g for g in grasps if g.T_bin_tcp[2, 3] < 0.05]
+    assert deep, "the part at the bottom of the shaft is seen and would seal"
+    scene = clearance.obstacles(heights, shaft.job.bin)
+    assert max(clearance.clearance(g, shaft.job.tool, scene) for g in deep) < 0.002
+
+
+def test_unseen_space_is_an_obstacle(plant, slab):
+    boxes = [slab(0, 0, 0.06, 0.04, 0.02), slab(0.055, 0, 0.03, 0.05, 0.09)]
+    planted = plant(boxes, unseen=((0.032, 0.0, 0.024),))
+    heights, _, grasps, _ = found(planted)
+    scene = clearance.obstacles(heights, planted.job.bin)
+    low = [g for g in grasps if g.T_bin_tcp[2, 3] < 0.03]
+    assert low
+    # what is hidden may be as high as the tall box beside it, up to the border of the unseen disc
+    assert max(clearance.clearance(g, planted.job.tool, scene) for g in low if g.T_bin_tcp[0, 3] > -0.005) < 0.002
+
+
+def test_the_sieve_never_stops_what_the_exact_check_passes(plant, slab):
+    boxes = [slab(-0.08, 0, 0.06, 0.04, 0.03), slab(0.0, 0.03, 0.05, 0.04, 0.05, 0.3), slab(0.08, -0.03, 0.05, 0.04, 0.015)]
+    planted = plant(boxes, noise_px=0.15)
+    heights, _, grasps, _ = found(planted)
+    scene = clearance.obstacles(heights, planted.job.bin)
+    for grasp, hit in zip(grasps, clearance.blocked(grasps, planted.job.tool, heights), strict=True):
+        if hit:
+            assert clearance.clearance(grasp, planted.job.tool, scene) < planted.job.recipe.limits.margin_m
+
+
+def test_the_order_does_not_depend_on_the_order_of_candidates(plant, slab):
+    boxes = [slab(-0.08, 0, 0.06, 0.04, 0.03), slab(0.0, 0.03, 0.06, 0.04, 0.03), slab(0.08, -0.03, 0.06, 0.04, 0.03)]
+    planted = plant(boxes, noise_px=0.15)
+    heights, segments, grasps, _ = found(planted)
+    ranked = [g.T_bin_tcp.tobytes() for g in rank.rank(grasps, segments, planted.job.tool)]
+    assert ranked == [g.T_bin_tcp.tobytes() for g in rank.rank(grasps[::-1], segments, planted.job.tool)]
+
+
+def message(**changes):
+    pose = PoseMessage(position_m=(0.0, 0.0, 0.05), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+    fields = {"id": "1-1", "rank": 1, "tool": ToolMessage(number=1, name="suction", kind="suction"), "frame": "bin",
+              "position_m": pose.position_m, "quaternion_xyzw": pose.quaternion_xyzw, "T_frame_pregrasp": pose, "approach_m": 0.08,
+              "lift_m": 0.15, "open_m": 0.0, "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
+              "sigma": Sigma(xy_m=0.001, z_m=0.001, tilt_rad=0.01)}
+    return GraspMessage(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(("changes", "objection"), [
+    ({}, ""),
+    ({"quaternion_xyzw": (1.0, 0.0, 0.0, 0.1)}, "quaternion"),
+    ({"position_m": (0.2, 0.0, 0.05)}, "outside_bin"),
+    ({"position_m": (0.0, 0.0, -0.03)}, "outside_bin"),
+    ({"quaternion_xyzw": (0.0, 0.0, 0.0, 1.0)}, "tilt"),
+    ({"position_m": (0.0, 0.09, 0.05)}, "out_of_reach"),
+])
+def test_the_last_gate(job, changes, objection):
+    limits = job.recipe.limits.model_copy(update={"reach": job.recipe.limits.reach.model_copy(
+        update={"max_m": (10.0, 0.08, 10.0)})})
+    assert gate.objection(message(**changes), np.eye(4), np.eye(4), job.bin, job.tool, limits) == objection
+
+
+def test_the_last_gate_stops_what_is_not_finite(job):
+    nan = message().model_copy(update={"position_m": (float("nan"), 0.0, 0.0)})
+    assert gate.objection(nan, np.eye(4), np.eye(4), job.bin, job.tool, job.recipe.limits) == "not_finite"
+
+
+def test_a_grasp_is_a_value(plant, slab):
+    planted = plant([slab(0, 0, 0.06, 0.04, 0.05)])
+    *_, grasps, _ = found(planted)
+    assert replace(grasps[0], quality=0.5).quality == 0.5
+    assert grasps[0].quality == 0.0
