@@ -1,5 +1,6 @@
 """Every test: no leaked threads, free ports, a time limit."""
 
+import contextlib
 import faulthandler
 import signal
 import socket
@@ -48,3 +49,19 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def gige_addresses() -> tuple[str, str]:
+    """Two loopback addresses whose GigE Vision port, which is fixed, was free a moment ago."""
+    for number in range(20, 250):
+        addresses = (f"127.0.{number}.2", f"127.0.{number}.3")
+        with contextlib.ExitStack() as probes:
+            try:
+                for address in addresses:
+                    probe = probes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    probe.bind((address, 3956))
+            except OSError:
+                continue
+        return addresses
+    raise RuntimeError("no free pair of loopback addresses")

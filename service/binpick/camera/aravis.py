@@ -78,8 +78,6 @@ class AravisCamera:
     def open(self, deadline_ns: MonotonicNs) -> None:
         """Connects and starts the stream. Raises CameraNotFound, CameraHeld, CameraLost, CameraError."""
         self.close()
-        if self._retired is not None:      # of a camera that lives, it needs milliseconds; of a dead one, seconds
-            self._retired.join(0.2)
         driver = _Driver(self._name, self._packet_size, self._heartbeat_ms)
         self._driver, self._owner = driver, Owner(f"binpick-cam-{self._name}", driver.close)
         address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
@@ -108,10 +106,12 @@ class AravisCamera:
         return frame
 
     def close(self) -> None:
-        """Gives the camera back; at most 0.9 s. A lost one is being closed already, and nobody waits for that."""
+        """Gives the camera back; at most 0.9 s, and 0.1 s for one that failed, since that may take its thread long."""
         if self._owner is not None:
             self._owner.retire()
             self._owner.join(0.9)
+        elif self._retired is not None:
+            self._retired.join(0.1)
         self._owner = self._driver = None
         self._status = replace(self._status, connected=False)
 
@@ -155,6 +155,7 @@ class _Driver:
         self._exposure_us = self._gain_db = 0.0
         self._triggers = 0
         self._triggered_ns = 0
+        self._counted = (0, 0)
         self._first_id = 1
 
     def find(self, serial: str) -> str:
@@ -237,6 +238,7 @@ class _Driver:
         """Sends it; the camera's acknowledge has come when this returns."""
         _, glib = _library()
         self._triggers += 1
+        self._counted = self._count("n_resent_packets"), self._count("n_missing_packets")
         self._triggered_ns = time.monotonic_ns()
         try:
             self._camera.execute_command("TriggerSoftware")
@@ -245,16 +247,14 @@ class _Driver:
 
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> tuple[Frame, str]:
         """The frame of the last trigger and the name of the clock it is stamped by; frames of older triggers are dropped."""
-        stream, resent, missing = self._stream, self._count("n_resent_packets"), self._count("n_missing_packets")
+        stream = self._stream
         while True:
             buffer = stream.timeout_pop_buffer(int(max(0.0, remaining_s(deadline_ns) - POP_MARGIN_S) * 1e6))
             if buffer is None:
                 raise CameraLost(f"camera {self._name} took the trigger but sent no image", self._name)
             try:
                 if self._behind(buffer.get_frame_id()) == 0:
-                    frame = self._frame(buffer, sequence, self._count("n_resent_packets") - resent,
-                                        self._count("n_missing_packets") - missing)
-                    return frame, self._clock()
+                    return self._frame(buffer, sequence), self._clock()
             finally:
                 stream.push_buffer(buffer)
 
@@ -264,8 +264,10 @@ class _Driver:
             self._first_id = frame_id
         return (self._first_id + self._triggers - 1 - frame_id) % BLOCK_IDS
 
-    def _frame(self, buffer: Any, sequence: int, resends: int, missing: int) -> Frame:
+    def _frame(self, buffer: Any, sequence: int) -> Frame:
         aravis, _ = _library()
+        resends = self._count("n_resent_packets") - self._counted[0]
+        missing = self._count("n_missing_packets") - self._counted[1]
         status = buffer.get_status()
         if status != aravis.BufferStatus.SUCCESS:
             raise PairRefused(f"camera {self._name}: the image came incomplete ({status.value_nick}, {missing} packets "

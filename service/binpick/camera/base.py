@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 from binpick.data import CameraStatus, Frame, Light
 
@@ -10,6 +10,7 @@ MonotonicNs: TypeAlias = int
 Clock: TypeAlias = Callable[[], MonotonicNs]
 
 
+@runtime_checkable
 class Camera(Protocol):
     """One triggered camera, called by one thread at a time.
 

@@ -31,7 +31,7 @@ class FileCamera:
         self._clock = clock
         self._image: Image | None = None
         self._light = Light(exposure_us=0.0, gain_db=0.0, projector=False)
-        self._triggered_ns = 0
+        self._triggered = (0, 0)
         self._frames = 0
         self._name = name
 
@@ -52,14 +52,17 @@ class FileCamera:
     def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002
         """Takes note of the time."""
         self._opened()
-        self._triggered_ns = self._clock()
+        self._triggered = (sequence, self._clock())
 
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:  # noqa: ARG002
-        """The file's image."""
+        """The file's image. Raises CameraLost when there was no such trigger."""
         image = self._opened()
+        triggered, triggered_ns = self._triggered
+        if triggered != sequence:
+            raise CameraLost(f"camera {self._name} was not triggered", self._name)
         self._frames += 1
         return Frame(image=image, camera=self._name, sequence=sequence, frame_id=self._frames, timestamp_ns=0,
-                     triggered_ns=self._triggered_ns, received_ns=self._clock(), exposure_us=self._light.exposure_us,
+                     triggered_ns=triggered_ns, received_ns=self._clock(), exposure_us=self._light.exposure_us,
                      gain_db=self._light.gain_db)
 
     def close(self) -> None:

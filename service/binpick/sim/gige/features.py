@@ -32,8 +32,8 @@ class Feature:
     access: Literal["RO", "RW", "WO"] = "RW"
     address: int = 0
     length: int = 4
-    minimum: float = 0
-    maximum: float = 0xFFFFFFFF
+    minimum: int | float = 0
+    maximum: int | float = 0xFFFFFFFF
     unit: str = ""
     entries: dict[str, int] = field(default_factory=dict)
     bits: tuple[int, int] | None = None

@@ -5,7 +5,7 @@ import socket
 import threading
 from collections.abc import Callable
 from types import TracebackType
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 from binpick.data import Image, Light
 from binpick.errors import PortInUse
@@ -33,7 +33,7 @@ class GigePair:
         self._stop = threading.Event()
         self._discovery: threading.Thread | None = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "GigePair":
         self.start()
         return self
 

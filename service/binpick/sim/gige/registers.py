@@ -71,7 +71,7 @@ class Registers:
             self._memory[address:address + len(data)] = data
         return feature.name
 
-    def number(self, name: str, index: int = 0) -> float:
+    def number(self, name: str, index: int = 0) -> int | float:
         """The value of an integer, enumeration, boolean or float feature; `index` is its selector's value."""
         row = self._features[name]
         address = row.address + index * row.length
@@ -88,7 +88,7 @@ class Registers:
         """As `number`, for features that are whole numbers."""
         return int(self.number(name, index))
 
-    def set(self, name: str, value: float | str) -> None:
+    def set(self, name: str, value: int | float | str) -> None:
         """The camera changes one of its own features, whatever a client may do."""
         row = self._features[name]
         if isinstance(value, str):
