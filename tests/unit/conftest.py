@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
 
@@ -87,7 +88,10 @@ def plant(rig: Rig, job: settings.Job) -> Callable[..., Planted]:
             inside = (np.abs(hit[..., 0] - slab.x) < slab.length / 2) & (np.abs(hit[..., 1] - slab.y) < slab.width / 2)
             depth = np.where(inside & (t < depth), t, depth)
         point = origin + direction * depth[..., None]
-        measured = np.ones(depth.shape, dtype=bool)
+        # as the matcher's gate does: no pixel beside a step counts
+        rough = (rect.focal_px * rect.baseline_m / depth).astype(np.float32)
+        around = np.ones((5, 5), dtype=np.uint8)
+        measured = cv2.dilate(rough, around) - cv2.erode(rough, around) < 2
         for x, y, radius in unseen:
             measured &= np.hypot(point[..., 0] - x, point[..., 1] - y) > radius
         disparity = (rect.focal_px * rect.baseline_m / depth).astype(np.float32)
