@@ -18,9 +18,12 @@ NOT_MEASURED: Colour = (48, 46, 44)
 INK: Colour = (244, 240, 236)
 BANNER: dict[str, Colour] = {"poses": (84, 130, 34), "none": (30, 118, 186), "failed": (44, 44, 170)}
 BIN: Colour = (196, 176, 84)
+SHADOW: Colour = (20, 20, 20)
 BEST: Colour = (96, 220, 96)
 OTHERS: Colour = (64, 176, 250)
 RING = np.linspace(0, 2 * np.pi, 49)
+BRIGHTER = np.round(255 * (np.arange(256) / 255) ** 0.65).astype(np.uint8)
+"""For eyes: exposure is set for bright parts, and the bin around them is dark."""
 
 
 def render(inputs: CycleInput, cycle: CycleResult, name: str) -> tuple[str, bytes]:
@@ -77,7 +80,7 @@ def _overlay(inputs: CycleInput, cycle: CycleResult) -> bytes:
     result = cycle.result
     if cycle.rectified is None:
         return _png(_captioned(_colour(inputs.pair.left.image), _sentence(result.return_code), _banner(result.return_code)))
-    picture = _colour(cycle.rectified.left[:, cycle.rectified.margin:])
+    picture = _colour(cv2.LUT(cycle.rectified.left[:, cycle.rectified.margin:], BRIGHTER))
     if cycle.segments is not None:
         picture = _tinted(picture, cycle.segments.parts)
     if result.bin is not None and result.bin.T_camera_bin is not None:
@@ -100,7 +103,7 @@ def _tinted(picture: Picture, parts: np.ndarray) -> Picture:
                          cv2.COLOR_HSV2BGR)[0]
     on_part = labels > 0
     tint = table[labels]
-    mixed = np.where(on_part[..., None], cv2.addWeighted(picture, 0.68, tint, 0.32, 0), (picture * 0.62).astype(np.uint8))
+    mixed = np.where(on_part[..., None], cv2.addWeighted(picture, 0.68, tint, 0.32, 0), (picture * 0.75).astype(np.uint8))
     edges = cv2.morphologyEx(labels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     mixed[edges & on_part] = (0.35 * mixed + 0.65 * tint)[edges & on_part].astype(np.uint8)
     return np.ascontiguousarray(mixed)
@@ -119,26 +122,30 @@ def _draw_bin(picture: Picture, rectified: Rectified, T_camera_bin: Transform, i
 
 def _draw_grasp(picture: Picture, rectified: Rectified, T_camera_frame: Transform, grasp: GraspMessage,
                 radius_m: float) -> None:
-    """The cup's lip in its true size, the way it comes, its axis, and its rank."""
+    """The cup's lip in its true size, the line it comes along, and its rank beside the lip."""
     T_camera_tcp = T_camera_frame @ geometry.from_quaternion(np.array(grasp.position_m), np.array(grasp.quaternion_xyzw))
     lip = radius_m * np.stack([np.cos(RING), np.sin(RING), np.zeros_like(RING)], -1)
     ring = _project(rectified, geometry.transform(T_camera_tcp, lip))
     way = _project(rectified, geometry.transform(T_camera_tcp, np.array([[0, 0, -grasp.approach_m], [0, 0, 0.0]])))
     colour = BEST if grasp.rank == 1 else OTHERS
     scale = max(1.0, picture.shape[1] / 900)
-    for ink, extra in (((20, 20, 20), 3), (colour, 0)):  # dark below bright: readable on any ground
-        _line(picture, way, ink, round(scale) + extra)
+    along = way[0] - way[1]
+    length = float(np.linalg.norm(along))
+    away = along / length if length > 1 else np.array([0.0, -1.0])
+    beside = way[1] + away * max(length, float(np.ptp(ring, axis=0).max()) / 2 + 18 * scale)
+    for ink, extra in ((SHADOW, 3), (colour, 0)):  # dark below bright: readable on any ground
+        _line(picture, np.stack([beside, way[1]]), ink, round(scale) + extra)
         _line(picture, ring, ink, round(2 * scale) + extra)
-    _badge(picture, way[0], str(grasp.rank), colour, scale)
+    _badge(picture, beside, str(grasp.rank), colour, scale)
 
 
 def _badge(picture: Picture, centre: Float[np.ndarray, "2"], text: str, colour: Colour, scale: float) -> None:
     at = (round(float(centre[0])), round(float(centre[1])))
     radius = round(13 * scale)
-    cv2.circle(picture, at, radius + 2, (20, 20, 20), -1, cv2.LINE_AA)
+    cv2.circle(picture, at, radius + 2, SHADOW, -1, cv2.LINE_AA)
     cv2.circle(picture, at, radius, colour, -1, cv2.LINE_AA)
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 0.62 * scale, round(1.4 * scale))
-    cv2.putText(picture, text, (at[0] - width // 2, at[1] + height // 2), cv2.FONT_HERSHEY_DUPLEX, 0.62 * scale, (20, 20, 20),
+    cv2.putText(picture, text, (at[0] - width // 2, at[1] + height // 2), cv2.FONT_HERSHEY_DUPLEX, 0.62 * scale, SHADOW,
                 round(1.4 * scale), cv2.LINE_AA)
 
 
