@@ -1,0 +1,205 @@
+"""The frozen exam: two set-ups, five kinds of part, one table of optics, and the seeds to tune and to report on."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from binpick import geometry
+from binpick.errors import InputError
+from binpick.geometry import Transform
+from binpick.rig import Rig, RigCamera
+from binpick.settings import Cell
+
+Triple = tuple[float, float, float]
+
+TUNING_SEEDS = tuple(range(1, 11))
+REPORT_SEEDS = tuple(range(101, 111))
+IMAGE_SIZE_PX = (1936, 1216)
+PIXEL_UM = 3.45
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """One camera: focal lengths and principal point in px, distortion in OpenCV's order k1, k2, p1, p2, k3."""
+
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """Two cameras over a bin. Angles in degrees: `bin_euler_deg` about the left camera's x, y, z (180° about x turns z up)."""
+
+    name: str
+    left: Lens
+    right: Lens
+    right_position_m: Triple
+    right_rotvec_deg: Triple
+    bin_size_m: Triple
+    bin_wall_m: float
+    bin_position_m: Triple
+    bin_euler_deg: Triple
+    base_position_m: Triple
+    base_euler_deg: Triple
+
+    @property
+    def T_camera_bin(self) -> Transform:
+        """Bin coordinates in the left camera's frame."""
+        R = Rotation.from_euler("xyz", self.bin_euler_deg, degrees=True).as_matrix()
+        return geometry.make(R, np.array(self.bin_position_m))
+
+    @property
+    def T_base_bin(self) -> Transform:
+        """Bin coordinates in the robot base's frame: yawed and tilted, so that a frame error cannot hide."""
+        R = Rotation.from_euler("ZYX", self.base_euler_deg, degrees=True).as_matrix()
+        return geometry.make(R, np.array(self.base_position_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Primitive:
+    """A convex piece of a part, its axis along z: box (x, y, z), cylinder (Ø, Ø, length), hexagon (flats, flats, length)."""
+
+    shape: Literal["box", "cylinder", "hexagon"]
+    size_mm: Triple
+    at_mm: Triple = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of part: its pieces (they may overlap), diffuse reflectance 0 to 1, and strength of its gloss."""
+
+    pieces: tuple[Primitive, ...]
+    reflectance: float
+    gloss: float
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """Light, surface, lens and sensor. Radiance 1 = a white diffuser under the projector's full light at 1 m.
+
+    Shot and read noise as of a Sony IMX392 at 8 bit (10 500 e full well over 255 steps, 2.6 e read noise), plus what 8-bit
+    video adds; the rest was set on the tuning seeds so that plain SGBM errs as on path-traced renderings of such bins.
+    """
+
+    ambient: float = 0.16
+    lamp: float = 0.10
+    lamp_direction: Triple = (0.25, -0.35, 0.90)
+    projector: float = 1.0
+    projector_position_m: Triple = (0.075, -0.055, 0.0)
+    dot_pitch_px: float = 4.5
+    dot_sigma_px: float = 1.2
+    dark_between_dots: float = 0.10
+    interreflection: float = 0.35
+    occlusion_height_m: float = 0.06
+    gloss_power: int = 32
+    texture_contrast: float = 0.05
+    texture_pitch_m: float = 0.0010
+    reflectance_spread: float = 0.08
+    bin_reflectance: float = 0.22
+    bin_gloss: float = 0.03
+    table_reflectance: float = 0.30
+    blur_sigma_px: float = 0.65
+    vignetting: float = 0.18
+    electrons_per_step: float = 41.0
+    read_noise_steps: float = 0.5
+    black_level: float = 2.0
+    steps_per_us: float = 0.065
+
+
+SETUPS = {
+    "A": Setup(
+        name="A",
+        left=Lens((1740.6, 1740.1), (972.4, 603.8), (-0.0712, 0.0918, 0.00042, -0.00058, -0.0214)),
+        right=Lens((1738.9, 1739.3), (961.7, 612.5), (-0.0689, 0.0874, -0.00035, 0.00049, -0.0187)),
+        right_position_m=(0.1499, 0.0011, -0.0014), right_rotvec_deg=(0.28, -0.62, 0.35),
+        bin_size_m=(0.600, 0.400, 0.180), bin_wall_m=0.003,
+        bin_position_m=(0.081, -0.009, 1.000), bin_euler_deg=(182.6, -1.7, 3.1),
+        base_position_m=(0.58, -0.31, 0.07), base_euler_deg=(37.0, 3.0, 0.0)),
+    "B": Setup(
+        name="B",
+        left=Lens((3480.9, 3479.8), (964.9, 611.2), (-0.0436, 0.1120, -0.00031, 0.00044, -0.0720)),
+        right=Lens((3477.6, 3478.3), (971.8, 604.1), (-0.0402, 0.0965, 0.00037, -0.00029, -0.0555)),
+        right_position_m=(0.1500, -0.0009, 0.0012), right_rotvec_deg=(-0.21, -0.78, 0.30),
+        bin_size_m=(0.300, 0.200, 0.120), bin_wall_m=0.003,
+        bin_position_m=(0.069, 0.004, 0.950), bin_euler_deg=(178.1, 0.8, -1.4),
+        base_position_m=(0.46, 0.22, -0.05), base_euler_deg=(37.0, 3.0, 0.0)),
+}
+
+KINDS = {
+    "block": Kind((Primitive("box", (60, 40, 15)),), 0.46, 0.05),
+    "cylinder": Kind((Primitive("cylinder", (24, 24, 60)),), 0.36, 0.35),
+    "tee": Kind((Primitive("box", (64, 16, 16), (0, 22, 0)), Primitive("box", (16, 60, 16))), 0.40, 0.10),
+    "bracket": Kind((Primitive("box", (50, 40, 4), (0, 0, -13)), Primitive("box", (4, 40, 30), (-23, 0, 0))), 0.52, 0.25),
+    "bolt": Kind((Primitive("cylinder", (12, 12, 57.5)), Primitive("hexagon", (19, 19, 7.5), (0, 0, 25))), 0.42, 0.30),
+}
+
+OPTICS = Optics()
+
+
+def setup(name: str) -> Setup:
+    """A set-up by its name. Raises InputError."""
+    if name not in SETUPS:
+        raise InputError(f"there is no exam world {name!r}; there are {', '.join(SETUPS)}")
+    return SETUPS[name]
+
+
+def kinds(mixture: str, count: int) -> tuple[str, ...]:
+    """The kinds of `count` parts: all of one kind, or "mixed" for equal shares. Raises InputError."""
+    if mixture == "mixed":
+        return tuple(list(KINDS)[i % len(KINDS)] for i in range(count))
+    if mixture not in KINDS:
+        raise InputError(f"there is no kind of part {mixture!r}; there are mixed, {', '.join(KINDS)}")
+    return (mixture,) * count
+
+
+def rig(world: str) -> Rig:
+    """The rig as a perfect calibration would find it."""
+    s = setup(world)
+    R_rig_right = Rotation.from_rotvec(s.right_rotvec_deg, degrees=True).as_matrix()
+    T_right_rig = geometry.inverse(geometry.make(R_rig_right, np.array(s.right_position_m)))
+    cameras = (_camera("left", "SIM-LEFT", s.left, np.eye(4)), _camera("right", "SIM-RIGHT", s.right, T_right_rig))
+    return Rig.model_validate({
+        "image_size_px": IMAGE_SIZE_PX,
+        "cameras": cameras,
+        "T_base_rig": (s.T_base_bin @ geometry.inverse(s.T_camera_bin)).tolist(),
+    })
+
+
+def _camera(name: str, serial: str, lens: Lens, T_cam_rig: Transform) -> RigCamera:
+    (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
+    return RigCamera.model_validate({
+        "name": name, "serial": serial, "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+        "distortion": lens.distortion, "T_cam_rig": T_cam_rig.tolist()})
+
+
+def cell(world: str, bin_frame: Literal["camera", "base"] = "camera", **settings: Any) -> Cell:
+    """A cell file for a set-up: default tool; recipe 1 speaks UR rotation vectors, recipe 2 quaternions, both in `base`.
+
+    `settings` are top-level keys of the cell file, which replace those made here.
+    """
+    s = setup(world)
+    T_parent_bin = s.T_camera_bin if bin_frame == "camera" else s.T_base_bin
+    document: dict[str, Any] = {
+        "bin": {
+            "inner_size_m": s.bin_size_m, "wall_m": s.bin_wall_m,
+            "pose": {"frame": bin_frame, "position_m": T_parent_bin[:3, 3].tolist(),
+                     "quaternion_xyzw": geometry.quaternion(T_parent_bin).tolist()}},
+        "recipes": [
+            {"number": 1, "name": "ur", "pose_format": "ur_rxryrz_rad", "frame": "base"},
+            {"number": 2, "name": "quaternion", "pose_format": "quaternion_xyzw", "frame": "base"}],
+    }
+    return Cell.model_validate(document | settings)
+
+
+def sha256() -> str:
+    """Names the exam: any change of a table changes it."""
+    tables = {
+        "setups": {k: asdict(v) for k, v in SETUPS.items()}, "kinds": {k: asdict(v) for k, v in KINDS.items()},
+        "optics": asdict(OPTICS), "image": IMAGE_SIZE_PX, "tuning": TUNING_SEEDS, "report": REPORT_SEEDS,
+    }
+    return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
