@@ -14,7 +14,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -52,10 +52,6 @@ class Addresses:
         return f"binpick is up: page {self.page}, REST {self.rest}/v1{modbus}"
 
 
-Work = Callable[[Addresses], Awaitable[int]]
-"""What runs beside the daemon and ends it with an exit code."""
-
-
 def run_file(path: Path) -> int:
     """Runs the cell of a file until a signal; returns the exit code. Raises the faults of errors.py that stop a start."""
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -75,30 +71,32 @@ def cameras(cell: settings.Cell) -> Cameras:
     return CameraGroup(backends.make(cell.cameras), cell.cameras.max_skew_us)
 
 
-def run(cell: settings.Cell, rig: Rig, cameras: Cameras, work: Work | None = None) -> int:
-    """Runs a daemon over these cameras until a signal, or until `work` ends; returns the exit code.
+def run(cell: settings.Cell, rig: Rig, cameras: Cameras) -> int:
+    """Runs a daemon over these cameras until a signal; returns the exit code.
 
     Raises PortInUse; InputError when simulated cameras would be served on Modbus port 502.
     """
-    watchdog = threading.Timer(STOP_LIMIT_S, _abandon)
+    stop = asyncio.Event()
+    watchdog = threading.Timer(STOP_LIMIT_S, _abandon, [stop])
     watchdog.name, watchdog.daemon = "binpick-stop", True
     try:
-        return asyncio.run(_main(cell, rig, cameras, work, watchdog))
+        asyncio.run(_main(cell, rig, cameras, stop, watchdog))
     finally:
         watchdog.cancel()
+    return 0
 
 
-async def _main(cell: settings.Cell, rig: Rig, cameras: Cameras, work: Work | None, watchdog: threading.Timer) -> int:
-    stop = asyncio.Event()
+async def _main(cell: settings.Cell, rig: Rig, cameras: Cameras, stop: asyncio.Event, watchdog: threading.Timer) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, _signalled, stop, number)
     async with _serving(cell, rig, cameras) as (addresses, vital):
         sys.stdout.write(addresses.sentence() + "\n")
         sys.stdout.flush()
-        code = await _until(stop, vital, work(addresses) if work else None)
-        watchdog.start()
-        log.info("stopping")
-    return code
+        try:
+            await _until(stop, vital)
+        finally:
+            watchdog.start()
+            log.info("stopping")
 
 
 def _signalled(stop: asyncio.Event, number: int) -> None:
@@ -107,40 +105,35 @@ def _signalled(stop: asyncio.Event, number: int) -> None:
     stop.set()
 
 
-async def _until(stop: asyncio.Event, vital: set[asyncio.Task[Any]], work: Awaitable[int] | None) -> int:
-    """Waits for the signal (0), the work (its code), or the end of something that should never end (raises why)."""
-    ends: set[asyncio.Future[Any]] = {asyncio.ensure_future(stop.wait())}
-    working = asyncio.ensure_future(work) if work is not None else None
-    if working is not None:
-        ends.add(working)
+async def _until(stop: asyncio.Event, vital: set[asyncio.Task[Any]]) -> None:
+    """Waits for the signal. Raises what ended a task that should never end."""
+    signalled = asyncio.create_task(stop.wait())
     try:
-        await asyncio.wait(ends | vital, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({signalled, *vital}, return_when=asyncio.FIRST_COMPLETED)
         for task in vital:
             if task.done():
                 task.result()
                 raise RuntimeError(f"{task.get_name()} ended by itself")
-        return working.result() if working is not None and working.done() else 0
     finally:
-        for end in ends:
-            end.cancel()
-        await asyncio.gather(*ends, return_exceptions=True)
+        signalled.cancel()
 
 
 @contextlib.asynccontextmanager
 async def _serving(cell: settings.Cell, rig: Rig, cameras: Cameras,
                    ) -> AsyncIterator[tuple[Addresses, set[asyncio.Task[Any]]]]:
     """The daemon while it runs, and the tasks that must not end."""
-    from binpick.publish import rest
+    from binpick.publish import dashboard, rest
 
     refuse_simulation_on_502(cell, cameras.statuses())
-    with _recording(cell) as recorder:
+    rest_at = cell.publish.rest
+    with _recording(cell) as recorder, listen(rest_at.host, rest_at.port, "publish.rest") as listener:
         living = Cell(cell, rig, cameras, boot_id=secrets.randbelow(65535) + 1, recorder=recorder)
 
         def judged() -> health.Health:
             return health.judge(living.snapshot(), alive=living.alive, recording=recorder.status().trouble if recorder else "")
 
-        listener = listen(cell.publish.rest.host, cell.publish.rest.port, "publish.rest")
         api = rest.create_app(living, living, health=judged)
+        dashboard.attach(api, living, judged)
         async with _modbus(cell, living) as registers, _http(api, listener) as pages:
             guard = asyncio.create_task(_watch_simulation(cell, living), name="the guard of port 502")
             try:
@@ -246,7 +239,8 @@ def _quit(_number: int, _frame: object) -> NoReturn:
     raise SystemExit(0)
 
 
-def _abandon() -> None:
+def _abandon(stop: asyncio.Event) -> None:
+    """The watchdog's bite: what holds the exit now would hold it for ever."""
     log.warning("not everything ended within %.1f s; it is abandoned", STOP_LIMIT_S)
     logging.shutdown()
-    os._exit(0)
+    os._exit(0 if stop.is_set() else 1)

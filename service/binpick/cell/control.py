@@ -107,8 +107,8 @@ class Cell:
 
     @property
     def alive(self) -> bool:
-        """Whether the worker thread runs."""
-        return self._thread.is_alive()
+        """False only when the worker thread has died of a defect."""
+        return self._thread.is_alive() or self._thread.ident is None or self._board.state.stopping
 
     def stop(self) -> None:
         """READY falls, triggers are refused, what runs or holds is withdrawn; returns at once."""
@@ -119,13 +119,13 @@ class Cell:
         self.stop()
         loop = asyncio.get_running_loop()
         deadline = loop.time() + limit_s
-        while self.alive and loop.time() < deadline:
+        while self._thread.is_alive() and loop.time() < deadline:
             await asyncio.sleep(0.005)
         if self._supervisor is not None:
             self._supervisor.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._supervisor
-        ended = not self.alive
+        ended = not self._thread.is_alive()
         if not ended:
             log.warning("the cell's thread did not end within %.1f s and is abandoned", limit_s)
         return ended

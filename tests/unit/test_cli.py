@@ -1,0 +1,35 @@
+"""The command line: faults are one line, help is light."""
+
+import subprocess
+import sys
+
+import pytest
+
+from binpick import cli
+
+HEAVY = ("open3d", "nicegui", "cv2", "distributed", "mujoco", "fastapi", "uvicorn")
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["binpick", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return int(ended.value.code or 0)
+
+
+def test_a_fault_is_one_line_that_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "pick", "--left", "l.png", "--right", "r.png", "--rig", "nowhere.json", "--cell", "c.yaml",
+                "--out", "out") == 2
+    assert capsys.readouterr().err == (
+        "binpick: nowhere.json: there is no such rig file; make one with `binpick-calib solve`\n")
+
+
+def test_check_exits_with_the_worst_finding(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "check", "--cell", "nowhere.yaml") == 2
+    assert "FAIL" in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    probe = f"import sys, binpick.cli; print([name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
