@@ -49,7 +49,7 @@ class SlowCameras:
         return tuple(CameraStatus(name, self._open, simulated=True) for name in ("left", "right"))
 
 
-def main(rest_port: int, modbus_port: int, mode: str) -> int:
+def main(rest_port: int, modbus_port: int, mode: str) -> None:
     """Runs until a signal."""
     rig = Rig.model_validate({"image_size_px": SIZE, "cameras": [
         {"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
@@ -58,8 +58,9 @@ def main(rest_port: int, modbus_port: int, mode: str) -> int:
         "bin": {"inner_size_m": [0.6, 0.4, 0.18], "pose": {"position_m": [0, 0, 1], "rotvec_rad": [np.pi, 0, 0]}},
         "recipes": [{"frame": "camera"}], "control": "rest", "timeout_ms": 30000,
         "publish": {"rest": {"port": rest_port}, "modbus": {"host": "127.0.0.1", "port": modbus_port}}})
-    return app.run(cell, rig, SlowCameras(mode))
+    app.run(cell, rig, SlowCameras(mode))
+    app.leave()
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]))
+    main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3])

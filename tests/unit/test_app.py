@@ -47,8 +47,8 @@ publish: {{rest: {{port: {ports[0]}}}, modbus: {{host: 127.0.0.1, port: {ports[1
     return tmp_path / "cell.yaml"
 
 
-def serve(cell: settings.Cell) -> int:
-    return app.run(cell, RIG, app.cameras(cell))
+def serve(cell: settings.Cell) -> None:
+    app.run(cell, RIG, app.cameras(cell))
 
 
 def test_a_port_in_use_is_refused_by_name(cell_file: Path, ports: tuple[int, int]) -> None:
@@ -86,7 +86,7 @@ def test_a_daemon_serves_until_a_signal_and_leaves_nothing_behind(
 
     thread = threading.Thread(target=client)
     thread.start()
-    assert serve(settings.load(cell_file)) == 0
+    serve(settings.load(cell_file))
     thread.join()
     assert answers[0].json()["return_code"]["name"] == "no_depth"
     assert capfd.readouterr().out == (

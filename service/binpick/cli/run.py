@@ -14,4 +14,4 @@ def run(cell: Annotated[Path, typer.Option(help="Cell file.")]) -> None:
     from binpick import app, log
 
     log.configure()
-    raise typer.Exit(app.run_file(cell))
+    app.run_file(cell)
