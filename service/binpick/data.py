@@ -158,13 +158,15 @@ class HeightMap:
 class Segments:
     """Faces (for suction) and parts (ownership) on the same grid as `xyz`; label 0 is nobody.
 
-    `xyz` and `normal` are frame `bin`, `normal` points away from the surface towards the camera.
+    `xyz` and `normal` are frame `bin`, `normal` points away from the surface towards the camera. `part_points` are
+    the points of each part, `part_confidence` how sure it is that they are one part.
     """
 
     xyz: Cloud
     normal: Cloud
     faces: Labels
     parts: Labels
+    part_points: dict[int, Float32[np.ndarray, "n 3"]]
     part_confidence: dict[int, float]
 
 

@@ -84,14 +84,13 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
     T_bin_camera = geometry.inverse(frames.T_camera_bin)
     with clock.stage("bin"):
         measured = float(depth.measured.mean())
-        xyz_bin = geometry.transform(T_bin_camera, points.xyz)
-        heights = heightmap.height_map(xyz_bin, job.bin)
+        grid = surface(depth, rectified, T_bin_camera)
+        heights = heightmap.height_map(grid.xyz, job.bin)
         filled = load_carrier.filling(heights, job.bin)
     seen = CycleResult(_answer(inputs, frames, clock, Code.NO_DEPTH, filled), rectified, depth, points)
     if measured < LEAST_MEASURED:
         return seen
     with clock.stage("segment"):
-        grid = surface(depth, rectified, T_bin_camera)
         segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
     with clock.stage("grasp"):
         found, counts = suction.candidates(segments, job.tool, grid.sigma_z_m)

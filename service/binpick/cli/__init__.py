@@ -5,16 +5,24 @@ from typing import Any
 
 import typer
 
+from binpick.cli.bench import bench
 from binpick.cli.check import check
+from binpick.cli.demo import demo
+from binpick.cli.depth import depth
 from binpick.cli.pick import pick
 from binpick.cli.run import run
 from binpick.cli.schema import schema
+from binpick.cli.sim import sim
 from binpick.errors import BinpickError
 
 COMMANDS: tuple[Callable[..., Any], ...] = (
+    demo,
     run,
     check,
+    sim,
     pick,
+    depth,
+    bench,
     schema,
 )
 """In the order of `binpick --help`. Their modules import at their top only what is light."""

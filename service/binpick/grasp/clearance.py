@@ -8,10 +8,10 @@ only the approach is swept.
 import functools
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 from jaxtyping import Bool, Float32, Float64
-from scipy.spatial import cKDTree
 
 from binpick import geometry
 from binpick.data import Grasp, HeightMap
@@ -32,29 +32,23 @@ CONTACT_M = 0.003
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstacles:
-    """The solid's surface as points in the bin's frame, with a search tree over their x and y."""
+    """The solid: the watertight height map padded with the rim, and how far each cell stands above its lowest neighbour."""
 
-    points: Float64[np.ndarray, "n 3"]
-    tree: cKDTree
+    height: Float64[np.ndarray, "rows cols"]
+    side: Float64[np.ndarray, "rows cols"]
+    cell_m: float
+    origin_x_m: float
+    origin_y_m: float
 
 
 def obstacles(heights: HeightMap, model: Bin) -> Obstacles:
-    """Tops and sides of the watertight height map, surrounded by the rim."""
+    """The solid of a height map, surrounded by the rim."""
     pad = round(PAD_M / heights.cell_m)
     grid = np.pad(heights.watertight.astype(np.float64), pad, constant_values=model.inner_size_m[2])
-    rows, cols = grid.shape
-    x = heights.origin_x_m + (np.arange(cols) - pad + 0.5) * heights.cell_m
-    y = heights.origin_y_m + (np.arange(rows) - pad + 0.5) * heights.cell_m
-    tops = np.stack([*np.meshgrid(x, y), grid], axis=-1)
-    framed = np.pad(grid, 1, mode="edge")
-    lowest = np.min([framed[1:-1, :-2], framed[1:-1, 2:], framed[:-2, 1:-1], framed[2:, 1:-1]], axis=0)
-    count = np.floor(np.maximum(grid - lowest, 0) / SIDE_STEP_M).astype(int)
-    owner = np.repeat(np.arange(grid.size), count.ravel())
-    below = np.arange(len(owner)) - np.repeat(np.cumsum(count.ravel()) - count.ravel(), count.ravel()) + 1
-    sides = tops.reshape(-1, 3)[owner]
-    sides[:, 2] -= below * SIDE_STEP_M
-    points = np.concatenate([tops.reshape(-1, 3), sides])
-    return Obstacles(points=points, tree=cKDTree(points[:, :2]))
+    lowest = cv2.erode(grid, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+    return Obstacles(height=grid, side=grid - lowest, cell_m=heights.cell_m,
+                     origin_x_m=heights.origin_x_m - pad * heights.cell_m,
+                     origin_y_m=heights.origin_y_m - pad * heights.cell_m)
 
 
 def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
@@ -62,14 +56,12 @@ def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
 
     Points of the gripped surface under the cup do not count: the cup's compliance takes them. At most HORIZON_M is told.
     """
-    T_tcp_bin = geometry.inverse(grasp.T_bin_tcp)
-    local = geometry.transform(T_tcp_bin, scene.points[_within(grasp.T_bin_tcp, tool, scene)])
+    local = geometry.transform(geometry.inverse(grasp.T_bin_tcp), _beneath(grasp.T_bin_tcp, tool, scene))
     radial = np.hypot(local[:, 0], local[:, 1])
     touched = (local[:, 2] > -CONTACT_M) & (radial < _foot_radius_m(tool) + HORIZON_M / 4)
     local = local[~touched]
-    steps = np.linspace(0, tool.approach_m, 1 + int(np.ceil(tool.approach_m / SWEEP_STEP_M)))
     # the tool standing back by s is the scene standing forward by s
-    swept = (local[None] + np.stack([np.zeros_like(steps), np.zeros_like(steps), steps], axis=1)[:, None]).reshape(-1, 3)
+    swept = (local[None] - _backs(tool)[:, None]).reshape(-1, 3)
     near = swept[_near_bodies(swept, tool)]
     if not len(near):
         return HORIZON_M
@@ -77,14 +69,29 @@ def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
     return float(min(distance.min(), HORIZON_M))
 
 
-def _within(T_bin_tcp: Transform, tool: Tool, scene: Obstacles) -> list[int]:
-    """Points beneath the swept tool: a circle over its foot and its head."""
+def _beneath(T_bin_tcp: Transform, tool: Tool, scene: Obstacles) -> Float64[np.ndarray, "n 3"]:
+    """The solid's surface as points, tops and sides, in the rectangle of the bin's plane that the swept tool covers."""
     reach = max(_extent(body)[0] for body in tool.bodies) + HORIZON_M
-    length = max(-_extent(body)[1] for body in tool.bodies) + tool.approach_m
-    foot, back = T_bin_tcp[:2, 3], -T_bin_tcp[:2, 2]
-    middle = foot + back * length / 2
-    found: list[int] = scene.tree.query_ball_point(middle, reach + float(np.linalg.norm(back)) * length / 2, return_sorted=True)
-    return found
+    back = max(-_extent(body)[1] for body in tool.bodies) + tool.approach_m
+    ends = np.stack([T_bin_tcp[:2, 3], T_bin_tcp[:2, 3] - back * T_bin_tcp[:2, 2]])
+    origin = np.array([scene.origin_x_m, scene.origin_y_m])
+    size = np.array(scene.height.shape[::-1])
+    low = np.clip(np.floor((ends.min(axis=0) - reach - origin) / scene.cell_m), 0, size - 1).astype(int)
+    high = np.clip(np.ceil((ends.max(axis=0) + reach - origin) / scene.cell_m), 1, size).astype(int)
+    cells = slice(low[1], high[1]), slice(low[0], high[0])
+    x = origin[0] + (np.arange(low[0], high[0]) + 0.5) * scene.cell_m
+    y = origin[1] + (np.arange(low[1], high[1]) + 0.5) * scene.cell_m
+    tops = np.stack([*np.meshgrid(x, y), scene.height[cells]], axis=-1).reshape(-1, 3)
+    count = np.floor(scene.side[cells].ravel() / SIDE_STEP_M).astype(int)
+    sides = np.repeat(tops, count, axis=0)
+    sides[:, 2] -= (np.arange(len(sides)) - np.repeat(np.cumsum(count) - count, count) + 1) * SIDE_STEP_M
+    return np.concatenate([tops, sides])
+
+
+def _backs(tool: Tool) -> Float64[np.ndarray, "s 3"]:
+    """Where the TCP stands on its way, in the frame of the grasp: from the grasp back to the pre-grasp."""
+    steps = np.linspace(0, tool.approach_m, 1 + int(np.ceil(tool.approach_m / SWEEP_STEP_M)))
+    return np.stack([np.zeros_like(steps), np.zeros_like(steps), -steps], axis=1)
 
 
 def _extent(body: Body) -> tuple[float, float, float]:
@@ -139,14 +146,11 @@ def blocked(grasps: list[Grasp], tool: Tool, heights: HeightMap) -> Bool[np.ndar
     """
     if not grasps:
         return np.zeros(0, dtype=bool)
-    shell = _shell(tool)
-    steps = np.linspace(0, tool.approach_m, 1 + int(np.ceil(tool.approach_m / SWEEP_STEP_M)))
-    backs = np.stack([np.zeros_like(steps), np.zeros_like(steps), -steps], axis=1)
-    local = (shell[None] + backs[:, None]).reshape(-1, 3)
-    hit = np.zeros(len(grasps), dtype=bool)
-    for k, grasp in enumerate(grasps):
-        p = geometry.transform(grasp.T_bin_tcp, local)
-        hit[k] = bool((_height_at(p, heights) > p[:, 2]).any())
+    local = (_shell(tool)[None] + _backs(tool)[:, None]).reshape(-1, 3)
+    T_bin_tcp = np.stack([grasp.T_bin_tcp for grasp in grasps])
+    points = np.matmul(local, T_bin_tcp[:, :3, :3].transpose(0, 2, 1)) + T_bin_tcp[:, None, :3, 3]
+    height = _height_at(points.reshape(-1, 3), heights).reshape(points.shape[:2])
+    hit: Bool[np.ndarray, "n"] = (height > points[..., 2]).any(axis=1)
     return hit
 
 

@@ -17,9 +17,8 @@ PER_PART = 2
 
 def rank(grasps: list[Grasp], segments: Segments, tool: Tool) -> list[Grasp]:
     """Best first, with qualities, without near-duplicates, at most two per part."""
-    labels, counts = np.unique(segments.parts[segments.parts > 0], return_counts=True)
-    area_px = dict(zip(labels.tolist(), counts.tolist(), strict=True))
-    centre = {label: segments.xyz[segments.parts == label].mean(axis=0) for label in segments.part_confidence}
+    area_px = {label: len(points) for label, points in segments.part_points.items()}
+    centre = {label: points.mean(axis=0) for label, points in segments.part_points.items()}
     largest = max(area_px.values(), default=1)
     top = max((float(g.T_bin_tcp[2, 3]) for g in grasps), default=0.0)
     scored = []

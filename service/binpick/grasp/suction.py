@@ -95,11 +95,22 @@ def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: floa
     i, j = (np.broadcast_to(a, (len(spots), len(steps), len(steps))).reshape(len(spots), -1) for a in (i, j))
     origin = segments.xyz[spots[:, 0], spots[:, 1]].astype(np.float64)
     normal = segments.normal[spots[:, 0], spots[:, 1]].astype(np.float64)
-    T_bin_spot = np.stack([geometry.frame_of_axes(n, np.array([1.0, 0, 0]), o) for n, o in zip(normal, origin, strict=True)])
+    T_bin_spot = _frames(normal, origin)
     offset = segments.xyz[i, j] - origin[:, None].astype(np.float32)
-    local = np.einsum("nkc,nca->nka", offset, T_bin_spot[:, :3, :3].astype(np.float32))
+    local = np.matmul(offset, T_bin_spot[:, :3, :3].astype(np.float32))
     own = segments.parts[i, j] == segments.parts[spots[:, 0], spots[:, 1]][:, None]
     return Patch(local=local, own=own), T_bin_spot
+
+
+def _frames(normal: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4 4"]:
+    """Frames with z along the normals; x lies in the plane of z and the bin's x, or y where those are parallel."""
+    z = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    hint = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = hint - (hint * z).sum(axis=1, keepdims=True) * z
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    frames = np.tile(np.eye(4), (len(z), 1, 1))
+    frames[:, :3, 0], frames[:, :3, 1], frames[:, :3, 2], frames[:, :3, 3] = x, np.cross(z, x), z, origin
+    return frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,9 +187,8 @@ def _quantile(values: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"], s
 def _long_axes(segments: Segments) -> dict[int, geometry.Vector]:
     """The direction of the longest extent of every part, bin frame, sign fixed (first non-zero component positive)."""
     axes = {}
-    for label in segments.part_confidence:
-        points = segments.xyz[segments.parts == label].astype(np.float64)
-        _, vectors = np.linalg.eigh(np.cov(points.T))
+    for label, points in segments.part_points.items():
+        _, vectors = np.linalg.eigh(np.cov(points.T.astype(np.float64)))
         axis = vectors[:, 2]
         axes[label] = axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
     return axes

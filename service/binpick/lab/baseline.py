@@ -47,18 +47,28 @@ def run(left: Image, right: Image, rig: Rig, T_camera_bin: Transform, model: Bin
     wls = cv2.ximgproc.createDisparityWLSFilter(matcher)
     wls.setLambda(8000)
     wls.setSigmaColor(1.5)
-    filtered = wls.filter(raw, pair.left, disparity_map_right=raw_right)[:, pair.margin:]
+    filtered = wls.filter(raw, pair.left, disparity_map_right=raw_right)[:, pair.margin :]
     disparity = filtered.astype(np.float32) / 16 + view.min_disparity
-    disparity[(filtered <= 0) | (raw[:, pair.margin:] < 0)] = 0
-    Q = np.array([[1, 0, 0, view.x - rect.cx_px], [0, 1, 0, view.y - rect.cy_px], [0, 0, 0, rect.focal_px],
-                  [0, 0, 1 / rect.baseline_m, 0]])
+    disparity[(filtered <= 0) | (raw[:, pair.margin :] < 0)] = 0
+    Q = np.array(
+        [
+            [1, 0, 0, view.x - rect.cx_px],
+            [0, 1, 0, view.y - rect.cy_px],
+            [0, 0, 0, rect.focal_px],
+            [0, 0, 1 / rect.baseline_m, 0],
+        ]
+    )
     filtered_at = time.perf_counter()
     xyz = cv2.reprojectImageTo3D(disparity, Q)[disparity > 0]
     T_bin_rect = geometry.inverse(T_camera_bin) @ rect.T_camera_rect
     grasps = _grasps(geometry.transform(T_bin_rect, xyz), model)
     ended = time.perf_counter()
-    return Textbook(grasps, disparity, view, {"rectify": matched - began, "match": filtered_at - matched,
-                                              "grasp": ended - filtered_at, "total": ended - began})
+    return Textbook(
+        grasps,
+        disparity,
+        view,
+        {"rectify": matched - began, "match": filtered_at - matched, "grasp": ended - filtered_at, "total": ended - began},
+    )
 
 
 def _grasps(points: Float32[np.ndarray, "n 3"], model: Bin) -> list[Transform]:
@@ -69,8 +79,9 @@ def _grasps(points: Float32[np.ndarray, "n 3"], model: Bin) -> list[Transform]:
     if len(cloud.points) < 100:
         return []
     length, width, _ = model.inner_size_m
-    inside = o3d.geometry.AxisAlignedBoundingBox([-length / 2 + 0.005, -width / 2 + 0.005, -0.02],
-                                                 [length / 2 - 0.005, width / 2 - 0.005, 0.5])
+    inside = o3d.geometry.AxisAlignedBoundingBox(
+        [-length / 2 + 0.005, -width / 2 + 0.005, -0.02], [length / 2 - 0.005, width / 2 - 0.005, 0.5]
+    )
     cloud = cloud.crop(inside)
     if len(cloud.points) < 100:
         return []

@@ -24,20 +24,26 @@ class DepthScore:
 
 def plain_sgbm(rectified: Rectified) -> Field:
     """Disparity of the yardstick every table is read against: SGBM 3-way, left pass only; NaN = not matched."""
-    matcher = cv2.StereoSGBM.create(0, rectified.window.num_disparities, 5, 200, 800, 1, 0, 10, 100, 2,
-                                    cv2.STEREO_SGBM_MODE_SGBM_3WAY)
-    raw = matcher.compute(rectified.left, rectified.right)[:, rectified.margin:]
+    matcher = cv2.StereoSGBM.create(
+        0, rectified.window.num_disparities, 5, 200, 800, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_SGBM_3WAY
+    )
+    raw = matcher.compute(rectified.left, rectified.right)[:, rectified.margin :]
     disparity: Field = raw.astype(np.float32) / 16 + np.float32(rectified.window.min_disparity)
     disparity[raw < 0] = np.nan
     return disparity
 
 
-def score(disparity: Field, truth: Field, on_part: Bool[np.ndarray, "h w"],
-          visible_both: Bool[np.ndarray, "h w"]) -> DepthScore:
+def score(
+    disparity: Field, truth: Field, on_part: Bool[np.ndarray, "h w"], visible_both: Bool[np.ndarray, "h w"]
+) -> DepthScore:
     """Scores a disparity map (NaN = not measured) on the pixels of parts."""
     judged = on_part & np.isfinite(truth)
     error = np.abs(disparity - truth)[judged & np.isfinite(disparity)]
     seen = judged & visible_both
     return DepthScore(
-        bad1=float((error > 1).mean()), bad2=float((error > 2).mean()), median_px=float(np.median(error)),
-        density=float(np.isfinite(disparity)[seen].mean()), pixels=int(seen.sum()))
+        bad1=float((error > 1).mean()),
+        bad2=float((error > 2).mean()),
+        median_px=float(np.median(error)),
+        density=float(np.isfinite(disparity)[seen].mean()),
+        pixels=int(seen.sum()),
+    )

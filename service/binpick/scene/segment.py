@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from binpick.data import Labels, Mask, Segments, frozen
 from binpick.scene import euclid, grid
@@ -22,8 +22,11 @@ def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSetti
     spacing_m = _spacing(surface, of_interest)
     least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
     faces, parts = _drop_small(faces, least), _drop_small(parts, least)
+    masks = {label: (box, parts[box] == label) for label, box in _boxes(parts).items()}
+    points = {label: surface.xyz[box][mask] for label, (box, mask) in masks.items()}
     return Segments(xyz=frozen(surface.xyz), normal=frozen(surface.normal), faces=frozen(faces), parts=frozen(parts),
-                    part_confidence=_confidence(surface, parts, part))
+                    part_points=points,
+                    part_confidence={label: _confidence(points[label], mask, part) for label, (_, mask) in masks.items()})
 
 
 def _inside(surface: Surface, model: Bin) -> Mask:
@@ -53,22 +56,16 @@ def _drop_small(labels: Labels, least: int) -> Labels:
     return kept
 
 
-def _confidence(surface: Surface, parts: Labels, part: PartSize) -> dict[int, float]:
+def _confidence(points: Float32[np.ndarray, "n 3"], mask: Mask, part: PartSize) -> float:
     """How sure a segment is one part: its extent against the largest part's, and how well it fills its outline's hull.
 
     A segment grown over two parts is long or ragged; its height must not win by itself, so this multiplies the quality.
     """
-    confidence = {}
-    for label, (rows, cols) in _boxes(parts).items():
-        mask = parts[rows, cols] == label
-        points = surface.xyz[rows, cols][mask][:, :2]
-        (_, (a, b), _) = cv2.minAreaRect(points.astype(np.float32))
-        excess = max(a, b) / part.max_size_m
-        outline = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-        hull = cv2.convexHull(np.concatenate(outline))
-        solidity = float(mask.sum()) / max(float(cv2.contourArea(hull)), float(mask.sum()), 1.0)
-        confidence[label] = round(float(np.clip(2 - excess, 0.1, 1)) * (0.4 + 0.6 * solidity), 4)
-    return confidence
+    (_, (a, b), _) = cv2.minAreaRect(np.ascontiguousarray(points[:, :2]))
+    outline = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    hull = cv2.convexHull(np.concatenate(outline))
+    solidity = float(mask.sum()) / max(float(cv2.contourArea(hull)), float(mask.sum()), 1.0)
+    return round(float(np.clip(2 - max(a, b) / part.max_size_m, 0.1, 1)) * (0.4 + 0.6 * solidity), 4)
 
 
 def _boxes(labels: Labels) -> dict[int, tuple[slice, slice]]:

@@ -1,0 +1,76 @@
+"""The exam's frames: a settled world, the pair its cameras take, and the truth behind it, made once per scene."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from binpick import settings
+from binpick.data import Frame, Light, StereoPair, Window
+from binpick.result import CycleInput, Request
+from binpick.sim import exam
+from binpick.sim.render import Renderer
+from binpick.sim.truth import Truth, truth
+from binpick.sim.world import World, WorldScene
+from binpick.stereo import rectify
+from binpick.stereo.rectify import Rectification
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paper:
+    """One question of the exam: what the pipeline gets, and the world it was taken of."""
+
+    inputs: CycleInput
+    scene: WorldScene
+
+    @property
+    def rect(self) -> Rectification:
+        """The rectified view the truth is cast in."""
+        return rectify.rectification(self.inputs.rig)
+
+    def truth(self, view: Window) -> Truth:
+        """True disparity, part ids and visibility of a window."""
+        rect = self.rect
+        return truth(self.scene, rect.T_camera_rect, rect.focal_px, rect.cx_px, rect.cy_px, rect.baseline_m, view)
+
+
+@functools.cache
+def renderer(world: str) -> Renderer:
+    """The world's renderer; its rays are worth keeping."""
+    return Renderer(exam.rig(world), world)
+
+
+def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin") -> Paper:
+    """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame."""
+    scene = World(world, kinds, parts, seed).scene()
+    job = settings.resolve(exam.cell(world), recipe)
+    light = Light(job.recipe.exposure_us, job.recipe.gain_db, job.recipe.projector)
+    frames = [
+        Frame(
+            image=renderer(world).expose(scene, index, light, seed),
+            camera=name,
+            sequence=1,
+            frame_id=1,
+            timestamp_ns=0,
+            triggered_ns=0,
+            received_ns=1,
+            exposure_us=light.exposure_us,
+            gain_db=light.gain_db,
+        )
+        for index, name in enumerate(("left", "right"))
+    ]
+    pair = StereoPair(
+        left=frames[0], right=frames[1], captured_at="2026-01-01T00:00:00Z", skew_us=0.0, sigma_us=0.0, proof="simulated"
+    )
+    request = Request.model_validate({"frame": frame})
+    return Paper(CycleInput(1, pair, exam.rig(world), job, request, simulated=True), scene)
+
+
+def wilson(good: int, of: int) -> tuple[float, float]:
+    """The 95 % Wilson score interval of a share (Wilson 1927)."""
+    if of == 0:
+        return 0.0, 1.0
+    z, p = 1.959964, good / of
+    middle = (p + z * z / (2 * of)) / (1 + z * z / of)
+    half = z / (1 + z * z / of) * float(np.sqrt(p * (1 - p) / of + z * z / (4 * of * of)))
+    return max(0.0, middle - half), min(1.0, middle + half)

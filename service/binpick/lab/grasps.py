@@ -1,0 +1,109 @@
+"""First cycles of the exam: ours and the textbook pipeline on the same frames, judged by the simulator's truth."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from binpick import geometry, pipeline
+from binpick.data import Window
+from binpick.geometry import Transform
+from binpick.lab import baseline, exam, stereo
+from binpick.lab.exam import Paper
+from binpick.lab.stereo import DepthScore
+from binpick.result import CycleResult
+from binpick.sim import score
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One pipeline's cycle on one scene: what its depth is worth, whether its grasps are good, and its seconds."""
+
+    depth: DepthScore
+    good: tuple[bool, ...]
+    penetration_m: tuple[float, ...]
+    seconds: tuple[float, ...]
+
+    @property
+    def top_is_good(self) -> bool:
+        """Whether there was a first grasp and the judge passed it."""
+        return bool(self.good) and self.good[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """All answers on one scene. `textbook` rows: full frame and fixed range; the same with our window and range."""
+
+    seed: int
+    code: int
+    plain: DepthScore
+    ours: Answer
+    stages_ms: dict[str, float]
+    textbook: Answer | None = None
+    textbook_window: Answer | None = None
+
+
+def sit(world: str, seeds: Iterable[int], cycles: int, against_textbook: bool) -> Iterator[Scene]:
+    """Sits the exam, one scene at a time; `cycles` timed repetitions of ours, of which the median counts."""
+    for seed in seeds:
+        paper = exam.paper(world, seed)
+        outcome, seconds, stages = _ours(paper, cycles)
+        if outcome.rectified is None or outcome.depth is None:
+            raise RuntimeError("a settled world always has depth")
+        view = outcome.rectified.window
+        truth = paper.truth(view)
+        on_part = truth.part_id > 0
+        good, depths = judged(paper, [_T_bin_tcp(paper, g.position_m, g.quaternion_xyzw) for g in outcome.result.grasps])
+        ours = Answer(
+            stereo.score(outcome.depth.disparity, truth.disparity, on_part, truth.visible_both), good, depths, seconds
+        )
+        yield Scene(
+            seed=seed,
+            code=outcome.result.return_code.value,
+            ours=ours,
+            stages_ms=stages,
+            plain=stereo.score(stereo.plain_sgbm(outcome.rectified), truth.disparity, on_part, truth.visible_both),
+            textbook=_textbook(paper, None) if against_textbook else None,
+            textbook_window=_textbook(paper, view) if against_textbook else None,
+        )
+
+
+def _ours(paper: Paper, cycles: int) -> tuple[CycleResult, tuple[float, ...], dict[str, float]]:
+    """The outcome, seconds of each repetition after one warm-up, and the median of every stage in ms."""
+    outcome = pipeline.run(paper.inputs)
+    seconds, stages = [], []
+    for _ in range(cycles):
+        began = time.perf_counter()
+        outcome = pipeline.run(paper.inputs)
+        seconds.append(time.perf_counter() - began)
+        stages.append(outcome.result.timing_ms)
+    return (
+        outcome,
+        tuple(seconds),
+        {k: round(float(np.median([s[k] for s in stages])), 1) for k in (stages[0] if stages else {})},
+    )
+
+
+def _textbook(paper: Paper, view: Window | None) -> Answer:
+    inputs = paper.inputs
+    T_camera_bin = inputs.job.bin.T_parent_bin
+    book = baseline.run(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, T_camera_bin, inputs.job.bin, view)
+    truth = paper.truth(book.window)
+    disparity = np.where(book.disparity > 0, book.disparity, np.float32(np.nan)).astype(np.float32)
+    good, depths = judged(paper, book.grasps[:5])
+    depth = stereo.score(disparity, truth.disparity, truth.part_id > 0, truth.visible_both)
+    return Answer(depth, good, depths, (book.seconds["total"],))
+
+
+def judged(paper: Paper, grasps: Sequence[Transform]) -> tuple[tuple[bool, ...], tuple[float, ...]]:
+    """The judge's verdict on each T_bin_tcp, and how deep the tool would go into something, metres."""
+    verdicts = [score.judge(paper.scene, T_bin_tcp, paper.inputs.job.tool) for T_bin_tcp in grasps]
+    return tuple(v.ok for v in verdicts), tuple(v.penetration_m for v in verdicts)
+
+
+def _T_bin_tcp(paper: Paper, position_m: tuple[float, ...], quaternion_xyzw: tuple[float, ...]) -> Transform:
+    """The published pose; the exam asks for frame `bin`."""
+    if paper.inputs.request.frame != "bin":
+        raise ValueError("the exam's papers are answered in the bin's frame")
+    return geometry.from_quaternion(np.array(position_m), np.array(quaternion_xyzw))

@@ -1,0 +1,136 @@
+"""The whole pipeline on rendered pairs: the same bytes again, the right code for a scene without grasps, frames that agree."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from binpick import geometry, pipeline, recording
+from binpick.data import StereoPair
+from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
+from binpick.lab import exam
+from binpick.result import CycleInput, PoseMessage, Request
+
+
+@pytest.fixture(scope="module")
+def paper() -> exam.Paper:
+    return exam.paper("A", 1, parts=10)
+
+
+@pytest.fixture(scope="module")
+def outcome(paper):
+    return pipeline.run(paper.inputs)
+
+
+def with_images(inputs: CycleInput, left, right) -> CycleInput:
+    pair = inputs.pair
+    return replace(inputs, pair=StereoPair(replace(pair.left, image=left), replace(pair.right, image=right), pair.captured_at,
+                                           pair.skew_us, pair.sigma_us, pair.proof))
+
+
+def test_a_filled_bin_gives_grasps_in_order(outcome):
+    result = outcome.result
+    assert result.return_code.code is Code.OK
+    assert [g.rank for g in result.grasps] == list(range(1, len(result.grasps) + 1))
+    assert [g.quality for g in result.grasps] == sorted((g.quality for g in result.grasps), reverse=True)
+    assert result.funnel.counts["published"] == len(result.grasps)
+
+
+def test_a_recording_gives_the_same_bytes(paper, outcome, tmp_path):
+    recording.save(tmp_path / "cycle", paper.inputs, outcome.result)
+    inputs, stored = recording.load(tmp_path / "cycle")
+    assert pipeline.run(inputs).result.timeless_bytes() == stored.timeless_bytes() == outcome.result.timeless_bytes()
+
+
+def test_one_thread_gives_the_same_bytes(paper, outcome):
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        assert pipeline.run(paper.inputs).result.timeless_bytes() == outcome.result.timeless_bytes()
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def test_frames_tell_the_same_pose(paper, outcome):
+    rig, T_camera_bin = paper.inputs.rig, paper.inputs.job.bin.T_parent_bin
+    T_bin_tcp = pose(outcome.result.grasps[0])
+    for frame, T_frame_bin in (("camera", T_camera_bin), ("base", np.array(rig.T_base_rig) @ T_camera_bin)):
+        request = Request.model_validate({"frame": frame})
+        there = pipeline.run(replace(paper.inputs, request=request)).result.grasps[0]
+        assert there.frame == frame
+        assert np.allclose(pose(there), T_frame_bin @ T_bin_tcp, atol=1e-9)
+
+
+def pose(grasp):
+    return geometry.from_quaternion(np.array(grasp.position_m), np.array(grasp.quaternion_xyzw))
+
+
+def test_black_images_have_no_depth(paper):
+    black = np.zeros_like(paper.inputs.pair.left.image)
+    result = pipeline.run(with_images(paper.inputs, black, black)).result
+    assert result.return_code.code is Code.NO_DEPTH
+    assert not result.grasps
+
+
+def test_an_empty_bin_is_empty():
+    result = pipeline.run(exam.paper("A", 1, parts=0).inputs).result
+    assert result.return_code.code is Code.BIN_EMPTY
+    assert result.bin.coverage > 0.7
+
+
+def test_a_covered_empty_bin_is_not_called_empty():
+    inputs = exam.paper("A", 1, parts=0).inputs
+    left, right = (image.copy() for image in (inputs.pair.left.image, inputs.pair.right.image))
+    for image in (left, right):
+        image[:, 700:1300] = 0
+    assert pipeline.run(with_images(inputs, left, right)).result.return_code.code in (Code.BIN_UNKNOWN, Code.NO_DEPTH)
+
+
+def test_the_open3d_segmenter_gives_grasps_too(paper):
+    recipe = paper.inputs.job.recipe
+    segmented = recipe.model_copy(update={"segment": recipe.segment.model_copy(update={"method": "open3d"})})
+    result = pipeline.run(replace(paper.inputs, job=paper.inputs.job.model_copy(update={"recipe": segmented}))).result
+    assert result.return_code.code is Code.OK
+
+
+def test_images_of_another_size_are_refused(paper):
+    small = np.ascontiguousarray(paper.inputs.pair.left.image[::2, ::2])
+    with pytest.raises(ImageError, match="968x608"):
+        pipeline.run(with_images(paper.inputs, small, small))
+
+
+def test_a_base_that_is_not_known_is_refused(paper):
+    rig = paper.inputs.rig.model_copy(update={"T_base_rig": None})
+    with pytest.raises(FrameUnavailable):
+        pipeline.run(replace(paper.inputs, rig=rig, request=Request.model_validate({"frame": "base"})))
+
+
+def test_a_rig_on_the_flange_needs_and_uses_its_pose(paper):
+    T_base_rig = np.array(paper.inputs.rig.T_base_rig)
+    T_flange_rig = geometry.translation(0.01, 0.02, 0.03)
+    T_base_flange = T_base_rig @ geometry.inverse(T_flange_rig)
+    rig = paper.inputs.rig.model_copy(update={"T_base_rig": None, "T_flange_rig": tuple(map(tuple, T_flange_rig.tolist()))})
+    asked = Request.model_validate({"frame": "base"})
+    with pytest.raises(FlangePoseMissing):
+        pipeline.run(replace(paper.inputs, rig=rig, request=asked))
+    flange = PoseMessage(position_m=tuple(T_base_flange[:3, 3].tolist()),
+                         quaternion_xyzw=tuple(geometry.quaternion(T_base_flange).tolist()))
+    on_flange = pipeline.run(replace(paper.inputs, rig=rig, request=asked.model_copy(update={"T_base_flange": flange})))
+    fixed = pipeline.run(replace(paper.inputs, request=asked))
+    assert np.allclose(pose(on_flange.result.grasps[0]), pose(fixed.result.grasps[0]), atol=1e-9)
+
+
+def test_time_can_run_out_between_stages(paper):
+    class OutOfTime(Exception):
+        pass
+
+    asked = []
+
+    def proceed():
+        asked.append(1)
+        if len(asked) == 3:
+            raise OutOfTime
+
+    with pytest.raises(OutOfTime):
+        pipeline.run(paper.inputs, proceed)
