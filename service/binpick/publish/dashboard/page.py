@@ -30,23 +30,21 @@ class Page:
     def open(self) -> None:
         """Lays the page out in NiceGUI's current client and starts following."""
         ui.add_css(STYLE)
-        with ui.element("main"):
+        with ui.element("main").classes("cell"):
             self._panel("banner")
             with ui.element("section").classes("pictures"):
                 self._image("overlay.png")
+                self._image("left.png")
                 self._panel("caption")
             with ui.element("section").classes("facts"):
-                for name in ("result", "grasps"):
-                    self._panel(name)
+                self._panel("result")
+                self._panel("grasps")
                 with ui.element("div").classes("pair"):
-                    for name in ("funnel", "timings"):
-                        self._panel(name)
-                with ui.element("div").classes("pair"):
-                    with ui.element("div").classes("card"):
-                        ui.html("<h2>Left camera</h2>", sanitize=False)
-                        self._image("left.png")
-                    self._panel("cameras")
-            self._panel("counts")
+                    self._panel("funnel")
+                    self._panel("timings")
+            with ui.element("section").classes("foot"):
+                self._panel("cameras")
+                self._panel("counts")
         self._show(self._view.snapshot())
         following = background_tasks.create(self._follow(), name="binpick-page")
         ui.timer(1.0, self._tell_age)
@@ -58,7 +56,7 @@ class Page:
 
     def _image(self, name: str) -> None:
         # <img>, not ui.image, which would put the mount's path before the address
-        self._images[name] = ui.element("img").props(f'alt="{name}"').classes("picture")
+        self._images[name] = ui.element("img").props(f'alt="{name}"').classes(f"picture {Path(name).stem}")
         self._images[name].set_visibility(False)
 
     async def _follow(self) -> None:

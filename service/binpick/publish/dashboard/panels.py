@@ -1,6 +1,5 @@
 """The page's panels as HTML, pure from a snapshot; whatever did not come from here is escaped."""
 
-from collections.abc import Iterable
 from html import escape
 
 from binpick.data import CameraStatus
@@ -12,8 +11,8 @@ ROWS = 6
 """Grasps shown; more is for programs."""
 SUMS = ("total", "compute")
 """Times that are sums of others."""
-COUNTS = {"finished": "cycles", "refused": "refused", "aborted": "aborted", "timeouts": "timed out", "late": "late, dropped",
-          "camera_failures": "camera failures", "expired": "expired", "internal_errors": "internal errors"}
+COUNTS = {"finished": "cycles", "refused": "refused", "aborted": "aborted", "timeouts": "timed out", "late": "late",
+          "camera_failures": "camera faults", "expired": "expired", "internal_errors": "errors"}
 
 
 def banner(shown: Banner, snapshot: Snapshot) -> str:
@@ -45,17 +44,20 @@ def result(snapshot: Snapshot) -> str:
 
 def grasps(snapshot: Snapshot) -> str:
     """The last grasps: where, how good, how sure."""
-    found = snapshot.latest.result.grasps if snapshot.latest else ()
-    frame = f", mm in frame {found[0].frame}" if found else ""
+    if snapshot.latest is None:
+        return _card("Grasps", _nothing())
+    found = snapshot.latest.result.grasps
+    if not found:
+        return _card("Grasps", '<p class="none">None in the last cycle.</p>')
     rows = "".join(_grasp(grasp) for grasp in found[:ROWS])
     rest = f'<small class="more">and {len(found) - ROWS} more</small>' if len(found) > ROWS else ""
-    table = (f"<table><thead><tr><th>#</th><th>x</th><th>y</th><th>z</th><th>quality</th><th>σ xy</th><th>σ z</th><th>tool</th>"
-             f"</tr></thead><tbody>{rows}</tbody></table>{rest}" if found else '<p class="none">None in the last cycle.</p>')
-    return _card(f"Grasps{frame}", table)
+    return _card(f"Grasps, mm in frame {found[0].frame}",
+                 "<table><thead><tr><th>#</th><th>x</th><th>y</th><th>z</th><th>quality</th><th>σ xy</th><th>σ z</th>"
+                 f"<th>tool</th></tr></thead><tbody>{rows}</tbody></table>{rest}")
 
 
 def _grasp(grasp: GraspMessage) -> str:
-    x, y, z = (f"{1000 * value:.1f}" for value in grasp.position_m)
+    x, y, z = (f"{1000 * value:.1f}".replace("-", "−") for value in grasp.position_m)
     return (f'<tr><td class="rank">{grasp.rank}</td><td>{x}</td><td>{y}</td><td>{z}</td>'
             f'<td class="quality">{_bar(grasp.quality, "good")}<span>{grasp.quality:.2f}</span></td>'
             f"<td>{1000 * grasp.sigma.xy_m:.2f}</td><td>{1000 * grasp.sigma.z_m:.2f}</td>"
@@ -90,7 +92,7 @@ def timings(snapshot: Snapshot) -> str:
 
 def cameras(snapshot: Snapshot) -> str:
     """Each camera, and what is wrong with it."""
-    return _card("Cameras", "".join(_camera(status) for status in snapshot.cameras) or '<p class="none">None known yet.</p>')
+    return f"<div>{''.join(_camera(status) for status in snapshot.cameras)}</div>"
 
 
 def _camera(status: CameraStatus) -> str:
@@ -105,15 +107,12 @@ def _camera(status: CameraStatus) -> str:
 def counts(snapshot: Snapshot) -> str:
     """The foot of the page: what happened since the start."""
     known = dict(snapshot.counts)
-    tiles: list[tuple[str, str]] = [(f"{known.get(name, 0)}", label) for name, label in COUNTS.items()]
+    tiles = [(f"{known.get(name, 0)}", label) for name, label in COUNTS.items()]
     sync = snapshot.latest.result.sync if snapshot.latest else None
     if sync is not None:
-        tiles.append((f"{sync.skew_us:.0f} µs", f"skew ({sync.proof or 'unproved'})"))
-    return f"<footer>{_tiles(tiles)}</footer>"
-
-
-def _tiles(tiles: Iterable[tuple[str, str]]) -> str:
-    return "".join(f"<div><b>{escape(value)}</b><small>{escape(label)}</small></div>" for value, label in tiles)
+        tiles.append((f"{sync.skew_us:.0f} µs", f"skew, {sync.proof}"))
+    return "<footer>" + "".join(f'<div class="tile"><b>{escape(value)}</b><small>{escape(label)}</small></div>'
+                                for value, label in tiles) + "</footer>"
 
 
 def _card(title: str, content: str) -> str:

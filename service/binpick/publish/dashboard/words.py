@@ -11,8 +11,8 @@ Tone = Literal["good", "busy", "warn", "bad", "off"]
 OWNERS = {"modbus": "Modbus/TCP", "rest": "REST", "none": "nobody"}
 SURVIVORS = {"parts": "parts seen", "faces": "faces on them", "spots": "spots tried", "sealed": "the cup seals",
              "clear": "the tool is clear", "published": "published"}
-LOSSES = {"rim_not_on_one_part": "lip not on one part", "no_seal": "surface too uneven to seal", "tilt": "tilted too far",
-          "collide": "tool would hit something", "gate_not_finite": "last gate: not a number",
+LOSSES = {"rim_not_on_one_part": "lip off the part", "no_seal": "too uneven to seal", "tilt": "tilted too far",
+          "collide": "tool would collide", "gate_not_finite": "last gate: not a number",
           "gate_quaternion": "last gate: no unit quaternion",
           "gate_outside_bin": "last gate: outside the bin", "gate_out_of_reach": "last gate: out of reach",
           "gate_tilt": "last gate: tilted too far", "gate_older_than_trigger": "last gate: older than its trigger"}
@@ -54,7 +54,7 @@ def tone(code: ReturnCode) -> Tone:
 
 def hold(snapshot: Snapshot) -> str:
     """Whether the last result still holds."""
-    return "holds" if snapshot.valid else f"holds no longer: {snapshot.withdrawn}" if snapshot.withdrawn else "holds no longer"
+    return "valid" if snapshot.valid else f"no longer valid: {snapshot.withdrawn}" if snapshot.withdrawn else "no longer valid"
 
 
 def stage(name: str) -> str:
