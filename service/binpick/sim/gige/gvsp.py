@@ -11,7 +11,7 @@ import time
 from collections import OrderedDict
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from binpick.data import Image
 from binpick.sim.gige.features import GVSP_OVERHEAD, MONO8
@@ -30,7 +30,7 @@ MAX_SEGMENTS = 60
 
 
 class Block:
-    """One image in packets: 0 is the leader, then the payload, last the trailer."""
+    """One image in packets: 0 is the leader, then the payload, last the trailer. `sent` of them have left already."""
 
     def __init__(self, number: int, timestamp_ns: int, image: Image, packet_size: int) -> None:
         height, width = image.shape
@@ -38,6 +38,7 @@ class Block:
         data = np.ascontiguousarray(image).reshape(-1)
         whole = data.size // payload
         self.number = number
+        self.sent = 0
         self.rows: UInt8[np.ndarray, "packets bytes"] = np.empty((whole, HEADER + payload), np.uint8)
         self.rows[:, :5] = np.frombuffer(_header(number, PAYLOAD, 0)[:5], np.uint8)
         self.rows[:, 5:HEADER] = np.arange(1, whole + 1, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]
@@ -107,19 +108,21 @@ class Sender:
             lost = self._random.random(block.count) < self._loss
         if not lost[0]:
             self._socket.sendto(block.leader, target)
-        self._send_rows(block.rows[~lost[1:1 + len(block.rows)]], target)
+        self._send_rows(block, ~lost[1:1 + len(block.rows)], target)
         for packet, gone in zip(block.tail, lost[1 + len(block.rows):], strict=True):
             if not gone:
                 self._socket.sendto(packet, target)
+        block.sent = block.count
 
-    def _send_rows(self, rows: UInt8[np.ndarray, "packets bytes"], target: tuple[str, int]) -> None:
-        if not len(rows):
-            return
-        size = rows.shape[1]
+    def _send_rows(self, block: Block, kept: Bool[np.ndarray, "packets"], target: tuple[str, int]) -> None:
+        size = block.rows.shape[1]
         segments = self._segments(size)
         start = time.monotonic()
-        for first in range(0, len(rows), segments):
-            self._socket.sendto(rows[first:first + segments].data, target)
+        for first in range(0, len(kept), segments):
+            burst = block.rows[first:first + segments][kept[first:first + segments]]
+            if len(burst):
+                self._socket.sendto(burst.data, target)
+            block.sent = 1 + min(first + segments, len(kept))
             ahead = start + (first + segments) * size * 8 / self._bits_per_s - time.monotonic()
             if ahead > 0.0002:       # shorter sleeps overshoot
                 time.sleep(ahead)
@@ -133,12 +136,12 @@ class Sender:
         return max(1, min(MAX_SEGMENTS, BURST_BYTES // size))
 
     def resend(self, target: tuple[str, int], number: int, first: int, last: int) -> None:
-        """Packets `first` to `last` of a kept block; of one that is no longer kept, nothing."""
+        """Packets `first` to `last` of a kept block, as far as they have been sent once; of other blocks, nothing."""
         with self._lock:
             block = self._kept.get(number)
             if block is None:
                 return
-            chosen = range(first, min(last, block.count - 1) + 1)
+            chosen = range(first, min(last + 1, block.sent))
             lost = self._random.random(len(chosen)) < self._loss
             self.resent += len(chosen)
         for index, gone in zip(chosen, lost, strict=True):

@@ -1,0 +1,150 @@
+"""A pair is refused unless it is one: skew, missing packets, old frames, sizes; and failures name their camera."""
+
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from binpick.camera.base import MonotonicNs
+from binpick.camera.group import CameraGroup
+from binpick.data import CameraStatus, Frame, Image, Light
+from binpick.errors import CameraError, CameraLost, PairRefused
+from binpick.sim.camera import SimCamera
+
+LIGHT = Light(exposure_us=100.0, gain_db=0.0, projector=True)
+
+
+def image_of(height: int = 8) -> Image:
+    return np.zeros((height, 12), np.uint8)
+
+
+def within(seconds: float) -> MonotonicNs:
+    return time.monotonic_ns() + int(seconds * 1e9)
+
+
+class Odd(SimCamera):
+    """A camera whose frames differ from the ordinary by `changes`, on the clock named `clock`."""
+
+    def __init__(self, index: int, clock: str = "ptp", height: int = 8, **changes: int) -> None:
+        super().__init__(index, lambda _index, _light, _shot: image_of(height))
+        self.changes = changes
+        self.clock = clock
+        self.lights: list[Light] = []
+        self.opened = 0
+
+    def open(self, deadline_ns: MonotonicNs) -> None:
+        super().open(deadline_ns)
+        self.opened += 1
+
+    def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
+        super().configure(light, deadline_ns)
+        self.lights.append(light)
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+        frame = super().grab(sequence, deadline_ns)
+        shift = {name: getattr(frame, name) + value for name, value in self.changes.items()}
+        return replace(frame, **({"timestamp_ns": 0} | shift))
+
+    def status(self) -> CameraStatus:
+        return replace(super().status(), clock=self.clock)
+
+
+def grouped(left: SimCamera, right: SimCamera, max_skew_us: float = 500.0) -> CameraGroup:
+    group = CameraGroup((left, right), max_skew_us, wall_clock=lambda: datetime(2026, 1, 2, tzinfo=UTC))
+    group.open(within(1))
+    return group
+
+
+class Late(Odd):
+    """Stamps its first `late` frames 9 ms late."""
+
+    late = 0
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+        frame = super().grab(sequence, deadline_ns)
+        self.late -= 1
+        return replace(frame, timestamp_ns=9_000_000 if self.late >= 0 else 0)
+
+
+def test_on_one_clock_the_time_stamps_tell_the_skew() -> None:
+    left, right = Odd(0), Odd(1)
+    right.changes = {}
+    pair = grouped(left, right).capture(LIGHT, within(2))
+    assert (pair.skew_us, pair.sigma_us, pair.proof) == (0.0, 1.0, "ptp")
+    assert pair.captured_at == "2026-01-02T00:00:00.000+00:00"
+    assert not pair.left.image.flags.writeable
+
+
+@pytest.mark.parametrize("clocks", [("", ""), ("ptp", "")])
+def test_on_clocks_of_their_own_the_host_tells_it(clocks: tuple[str, str]) -> None:
+    pair = grouped(Odd(0, clocks[0]), Odd(1, clocks[1]), 1e6).capture(LIGHT, within(2))
+    assert pair.proof == "host"
+    assert pair.skew_us > 0
+    assert 0 < pair.sigma_us < 2 * pair.skew_us
+
+
+def test_a_skewed_pair_is_shot_again() -> None:
+    left, right = Odd(0), Late(1)
+    right.late = 2
+    pair = grouped(left, right).capture(LIGHT, within(2))
+    assert (pair.skew_us, pair.left.sequence, pair.right.sequence) == (0.0, 3, 3)
+
+
+def test_a_skew_that_stays_is_refused() -> None:
+    left, right = Odd(0), Late(1)
+    right.late = 100
+    group = grouped(left, right)
+    with pytest.raises(PairRefused, match=r"9000 µs apart \(ptp\), more than the 500 µs allowed"):
+        group.capture(LIGHT, within(2))
+    assert [status.connected for status in group.statuses()] == [True, True]
+
+
+@pytest.mark.parametrize(("right", "reason"), [
+    (Odd(1, missing=3), "right: 3 packets"),
+    (Odd(1, sequence=-1), "right: the image is older than its trigger"),
+    (Odd(1, triggered_ns=-10**10), "right: the image is older than its trigger"),
+    (Odd(1, height=9), "differ in size: left 12x8, right 12x9"),
+])
+def test_no_pair(right: Odd, reason: str) -> None:
+    with pytest.raises(PairRefused, match=reason):
+        grouped(Odd(0), right).capture(LIGHT, within(2))
+
+
+def test_light_is_set_when_it_changes_and_after_opening() -> None:
+    left, right = Odd(0), Odd(1)
+    group = grouped(left, right)
+    brighter = replace(LIGHT, exposure_us=200.0)
+    for light in (LIGHT, replace(LIGHT), brighter, brighter):
+        group.capture(light, within(2))
+    assert [light.exposure_us for light in left.lights] == [100.0, 200.0]
+    right.fail = "dead"
+    with pytest.raises(CameraLost):
+        group.capture(brighter, within(2))
+    right.fail = ""
+    group.open(within(1))
+    group.capture(brighter, within(2))
+    assert [light.exposure_us for light in left.lights] == [100.0, 200.0, 200.0]
+    assert (left.opened, right.opened) == (1, 2)
+
+
+def test_both_dead_cameras_stand_in_one_error() -> None:
+    left, right = SimCamera(0, lambda *_: image_of()), SimCamera(1, lambda *_: image_of())
+    group = grouped(left, right)
+    left.fail = right.fail = "stuck"
+    start = time.monotonic()
+    with pytest.raises(CameraLost, match="left camera did not answer in time; the right camera did not") as caught:
+        group.capture(LIGHT, within(30))
+    assert time.monotonic() - start < 2
+    assert caught.value.camera == ""
+    assert all(status.error and not status.connected for status in group.statuses())
+    with pytest.raises(CameraError, match=r"left.*right"):
+        group.capture(LIGHT, within(30))
+    group.close()
+
+
+def test_a_group_that_was_never_opened_says_so() -> None:
+    group = CameraGroup((SimCamera(0, lambda *_: image_of()), SimCamera(1, lambda *_: image_of())), 500.0)
+    with pytest.raises(CameraError, match="camera left is not open; camera right is not open"):
+        group.capture(LIGHT, within(1))
