@@ -1,4 +1,4 @@
-"""A GigE Vision camera driven by Aravis, through GObject introspection; the only importer of gi.
+"""Aravis' objects for one camera, through GObject introspection: the only importer of gi; lives on one thread.
 
 Aravis' traps that shape this module (0.8.26, measured): every call on a dead camera blocks 2.5 s; the socket's buffer is set
 only after a frame's first packets; AcquisitionStop and Start on one stream lose frames silently; the packet socket that root
@@ -10,20 +10,15 @@ import functools
 import os
 import socket
 import time
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from binpick.camera import probe
 from binpick.camera.base import MonotonicNs, remaining_s
-from binpick.camera.owner import Owner
-from binpick.data import CameraStatus, Frame, Light
+from binpick.data import Frame, Light
 from binpick.errors import CameraError, CameraHeld, CameraLost, CameraNotFound, PairRefused
 
-T = TypeVar("T")
 BUFFERS = 6
 SOCKET_BUFFER_BYTES = 8 << 20
 """Three whole frames; the kernel clips it to net.core.rmem_max."""
@@ -56,101 +51,7 @@ def _library() -> tuple[Any, Any]:
     return Aravis, GLib
 
 
-class AravisCamera:
-    """One camera, by address (opened without discovery) or by serial number; with both, the serial is checked.
-
-    Its thread `binpick-cam-<name>` alone touches Aravis' objects. A verb that cannot end by its deadline raises CameraLost and
-    leaves that thread behind; the next `open` starts another.
-    """
-
-    def __init__(self, name: str, address: str, serial: str, packet_size: int = 1500, heartbeat_ms: int = 3000) -> None:
-        self._name = name
-        self._address = address
-        self._serial = serial
-        self._packet_size = packet_size
-        self._heartbeat_ms = heartbeat_ms
-        self._status = CameraStatus(name, connected=False, address=address, serial=serial)
-        self._driver: _Driver | None = None
-        self._owner: Owner | None = None
-        self._retired: Owner | None = None
-
-    @property
-    def name(self) -> str:
-        """As in every error."""
-        return self._name
-
-    def open(self, deadline_ns: MonotonicNs) -> None:
-        """Connects and starts the stream. Raises CameraNotFound, CameraHeld, CameraLost, CameraError."""
-        self.close()
-        driver = _Driver(self._name, self._packet_size, self._heartbeat_ms)
-        retired = self._retired
-        self._driver, self._owner = driver, Owner(f"binpick-cam-{self._name}", driver.close)
-        address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
-        if not probe.answers(address):
-            raise self._fail(CameraNotFound(f"camera {self._name}: no camera answers at {address}: check power, cable and the "
-                                            "address in the cell file", self._name))
-        if retired is not None:            # it still holds the camera; since that answers, it will let go soon
-            retired.join(remaining_s(deadline_ns) / 2)
-        facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
-        self._status = replace(self._status, connected=True, error="", address=address, **facts)
-
-    def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
-        """Exposure, gain, and whether the line that strobes the projector does so."""
-        driver = self._opened()
-        self._do("setting exposure and gain", lambda: driver.configure(light), deadline_ns)
-
-    def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002 - the frame's own affair in grab
-        """One software trigger."""
-        driver = self._opened()
-        self._do("triggering", driver.trigger, deadline_ns)
-
-    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
-        """The frame of that trigger. Raises CameraLost when none comes, PairRefused when packets stayed away."""
-        driver = self._opened()
-        frame, clock = self._do("waiting for its image", lambda: driver.grab(sequence, deadline_ns), deadline_ns)
-        status = self._status
-        self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends, clock=clock)
-        return frame
-
-    def close(self) -> None:
-        """Gives the camera back; at most 0.9 s, and 0.1 s for one that failed, since that may take its thread long."""
-        if self._owner is not None:
-            self._owner.retire()
-            self._owner.join(0.9)
-        elif self._retired is not None:
-            self._retired.join(0.1)
-        self._owner = self._driver = None
-        self._status = replace(self._status, connected=False)
-
-    def status(self) -> CameraStatus:
-        """What the last verb left behind."""
-        return self._status
-
-    def _opened(self) -> "_Driver":
-        if self._driver is None:
-            raise CameraLost(f"camera {self._name} is not open", self._name)
-        return self._driver
-
-    def _do(self, what: str, function: Callable[[], T], deadline_ns: MonotonicNs) -> T:
-        if self._owner is None:
-            raise CameraLost(f"camera {self._name} is not open", self._name)
-        try:
-            return self._owner.call(function, deadline_ns)
-        except TimeoutError:
-            raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}", self._name)) from None
-        except CameraError as error:
-            raise self._fail(error) from None
-
-    def _fail(self, error: CameraError) -> CameraError:
-        """After an error the camera is closed; its thread does that in its own time."""
-        if self._owner is not None:
-            self._owner.retire()
-        self._retired, self._owner, self._driver = self._owner, None, None
-        self._status = replace(self._status, connected=False, error=str(error), failures=self._status.failures + 1)
-        return error
-
-
-class _Driver:
+class Driver:
     """Aravis' objects and what is done to them; lives on the camera's thread."""
 
     def __init__(self, name: str, packet_size: int, heartbeat_ms: int) -> None:
