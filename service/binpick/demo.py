@@ -120,7 +120,7 @@ class Twin:
             T_base_tcp,
             verdict.distance_m,
             verdict.angle_rad,
-            verdict.penetration_m > score.COLLISION_M,
+            verdict.penetration_m > score.MAX_PENETRATION_M,
             recipe,
             result.acquire_ms,
             result.total_ms,
@@ -168,7 +168,7 @@ async def _picks(plan: Plan, twin: Twin, tool: settings.Tool, say: Console) -> l
     picks: list[Pick] = []
     barren = 0
     async with Plc("127.0.0.1", plan.modbus_port) as plc:
-        await plc.wait_ready(READY_S)
+        await plc.clear(READY_S)
         while len(picks) < (plan.cycles or 10 * plan.parts) and barren < 3:
             recipe = 1 + len(picks) % 2
             result = await plc.pick(recipe=recipe)
@@ -206,7 +206,7 @@ def files(plan: Plan, folder: Path) -> settings.Cell:
         recording={"directory": None if plan.recording is None else str(plan.recording.absolute())},
     )
     (folder / "rig.json").write_bytes(rig_file.dump(exam.rig(plan.world)))
-    (folder / "cell.yaml").write_text(yaml.safe_dump(cell.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
+    (folder / "cell.yaml").write_text(yaml.safe_dump(cell.model_dump(mode="json", exclude_unset=True)), encoding="utf-8")
     return cell
 
 

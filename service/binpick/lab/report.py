@@ -56,7 +56,7 @@ def _answers(answers: Sequence[Answer]) -> dict[str, Any]:
         "p_at_5": round(sum(five) / max(len(five), 1), 3),
         "published": len(five),
         "penetration_max_mm": round(1000 * max([p for a in answers for p in a.penetration_m], default=0), 2),
-        "collisions": sum(p > score.COLLISION_M for a in answers for p in a.penetration_m),
+        "collisions": sum(p > score.MAX_PENETRATION_M for a in answers for p in a.penetration_m),
         "cycles": len(seconds),
         "seconds_p50": round(float(np.median(seconds)), 4),
     }

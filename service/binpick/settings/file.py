@@ -47,10 +47,13 @@ def parse(text: str, name: str) -> Cell:
         raise SettingsError("; ".join(_say(name, tree, item) for item in causes[:3])) from error
 
 
+SENTENCES = {"extra_forbidden": "unknown key", "union_tag_not_found": "say which kind it is: `backend:` or `shape:` is missing"}
+
+
 def _say(name: str, tree: yaml.Node | None, item: Any) -> str:
     loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder")]
     key = ".".join(str(part) for part in loc)
-    message = "unknown key" if item["type"] == "extra_forbidden" else str(item["msg"])
+    message = SENTENCES.get(item["type"], str(item["msg"]))
     given = f" (it is {item['input']!r})" if isinstance(item.get("input"), int | float | str) else ""
     return f"{name}:{_line(tree, loc)}: {key + ': ' if key else ''}{message}{given}"
 
