@@ -145,7 +145,6 @@ async def _serving(cell: settings.Cell, rig: Rig, cameras: Cameras,
 
         api = rest.create_app(living, living, health=judged)
         dashboard.attach(api, living, judged)
-        dashboard.attach(api, living, judged)
         async with _modbus(cell, living) as registers, _http(api, listener) as pages:
             guard = asyncio.create_task(_watch_simulation(cell, living), name="the guard of port 502")
             try:

@@ -1,7 +1,8 @@
-"""SIGINT and SIGTERM end the daemon with exit code 0 within 3 s in every state, a listening SSE client or not."""
+"""SIGINT and SIGTERM end the daemon with exit code 0 within 3 s in every state, with an SSE client and a page open."""
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,6 +18,7 @@ import httpx
 import numpy as np
 import psutil
 import pytest
+from websockets.sync.client import ClientConnection, connect
 
 from binpick import rig as rig_file
 from binpick.rig import Rig
@@ -55,8 +57,10 @@ def free_ports() -> tuple[int, int]:
 @contextmanager
 def daemon(*command: str, rest_port: int) -> Iterator[Daemon]:
     """The daemon once it serves; killed with all its children if the test leaves it alive."""
+    # NiceGUI stops in another way when it believes to be under test
+    environment = {key: value for key, value in os.environ.items() if key != "PYTEST_CURRENT_TEST"}
     process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                               start_new_session=True)
+                               start_new_session=True, env=environment)
     try:
         assert process.stdout is not None
         for line in process.stdout:
@@ -77,6 +81,8 @@ def ends_well(running: Daemon, number: int) -> None:
     running.process.send_signal(number)
     assert running.process.wait(LIMIT_S + 7) == 0
     assert time.monotonic() - sent < LIMIT_S
+    assert running.process.stdout is not None
+    assert "Traceback" not in running.process.stdout.read()
     assert [child for child in children if child.is_running()] == []
 
 
@@ -87,6 +93,21 @@ def listening(running: Daemon) -> Iterator[httpx.Response]:
         yield response
 
 
+@contextmanager
+def page(running: Daemon) -> Iterator[ClientConnection]:
+    """The page as a browser holds it open: its HTML, then NiceGUI's socket with the handshake in the query."""
+    html = httpx.get(f"{running.base}/ui/", timeout=30).text
+    client_id = re.search(r"'client_id': '([^']+)'", html)
+    assert client_id is not None
+    query = (f"EIO=4&transport=websocket&implicit_handshake=true&client_id={client_id[1]}&document_id=d&tab_id=t&old_tab_id="
+             "&next_message_id=0")
+    with connect(f"{running.base.replace('http', 'ws')}/ui/_nicegui_ws/socket.io/?{query}", open_timeout=30) as socket_io:
+        assert str(socket_io.recv(30)).startswith("0{")
+        socket_io.send("40")
+        assert str(socket_io.recv(30)).startswith("40{")
+        yield socket_io
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("state", STATES)
@@ -94,7 +115,7 @@ def test_a_signal_ends_the_daemon_in_every_state(state: str, number: int) -> Non
     rest_port, modbus_port = free_ports()
     command = (str(HERE / "slow_cell.py"), str(rest_port), str(modbus_port), MODES.get(state, "quick"))
     with (daemon(*command, rest_port=rest_port) as running, socket.create_connection(("127.0.0.1", modbus_port)),
-          listening(running) as events):
+          listening(running) as events, page(running)):
         if state != "starting":
             running.wait_for("ready")
         if state in ("acquiring", "computing", "valid"):
