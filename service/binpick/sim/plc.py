@@ -6,7 +6,7 @@ Its way of reading checks and orientations is its own on purpose: an error of th
 import asyncio
 import contextlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
@@ -14,14 +14,15 @@ from typing import Literal
 import numpy as np
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
+from pymodbus.pdu import ModbusPDU
 from scipy.spatial.transform import Rotation
 
 from binpick import geometry
-from binpick.errors import BinpickError, Code, CycleTimeout, NotReady
+from binpick.errors import BinpickError, CycleTimeout, NotReady
 from binpick.geometry import Transform
 
 ENABLE, TRIG, RES_ACK, NEXT_PAGE, CLEAR_ERR, STROBE = 1, 2, 4, 8, 16, 128
-READY, ACK, NACK, BUSY, ACQ_DONE, VALID, ERROR, LAST_PAGE = 1, 2, 4, 8, 16, 32, 64, 256
+READY, ACK, NACK, ACQ_DONE, VALID, ERROR, LAST_PAGE = 1, 2, 4, 16, 32, 64, 256
 POLL_S = 0.01
 HEARTBEAT_S = 0.5
 MARGIN_S = 2.0
@@ -182,21 +183,24 @@ class Plc:
             await asyncio.sleep(HEARTBEAT_S)
 
     async def _read(self, address: int, count: int) -> list[int]:
-        try:
-            response = await self._client.read_input_registers(address, count=count)
-        except (ConnectionException, ModbusIOException) as error:
-            raise NotReady(f"the PLC lost the Modbus server: {error}") from error
-        if response.isError():
-            raise NotReady(f"reading {count} registers at {address} was answered with {response}")
-        return list(response.registers)
+        return list((await _answer(self._client.read_input_registers(address, count=count))).registers)
 
     async def _write(self, address: int, words: list[int]) -> None:
-        try:
-            response = await self._client.write_registers(address, words)
-        except (ConnectionException, ModbusIOException) as error:
-            raise NotReady(f"the PLC lost the Modbus server: {error}") from error
-        if response.isError():
-            raise NotReady(f"writing registers at {address} was answered with {response}")
+        await _answer(self._client.write_registers(address, words))
+
+
+async def _answer(request: Awaitable[ModbusPDU]) -> ModbusPDU:
+    try:
+        response = await request
+    except (ConnectionException, ModbusIOException) as error:
+        raise NotReady(f"the PLC lost the Modbus server: {error}") from error
+    # pymodbus waits with asyncio.wait_for, which in Python 3.11 swallows a cancellation that meets the answer.
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+    if response.isError():
+        raise NotReady(f"the Modbus server answered {response}")
+    return response
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,4 +245,4 @@ def _rotation(numbers: Sequence[float], pose_format: int) -> Rotation:
         return Rotation.from_rotvec([0, 0, a]) * Rotation.from_rotvec([0, b, 0]) * Rotation.from_rotvec([c, 0, 0])
     if pose_format == 4:
         return Rotation.from_euler("xyz", numbers[:3], degrees=True)
-    raise NotReady(f"unknown pose format {pose_format} ({Code.BAD_ARGUMENT.value})")
+    raise NotReady(f"the registers name an unknown pose format: {pose_format}")
