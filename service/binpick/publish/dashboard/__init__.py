@@ -21,7 +21,8 @@ def attach(app: FastAPI, view: View, health: Callable[[], Health]) -> None:
         app.add_api_route(path, _to_the_page, include_in_schema=False)
     # our style sheet is all the page needs: without Tailwind's compiler a wall display loads and idles lighter
     ui.run_with(app, root=lambda: Page(view, health).open(), mount_path=MOUNT, title="binpick", dark=True, favicon=FAVICON,
-                show_welcome_message=False, tailwind=False, binding_refresh_interval=None)
+                show_welcome_message=False, tailwind=False, binding_refresh_interval=None,
+                gzip_middleware_factory=None)
 
 
 def _to_the_page() -> RedirectResponse:
