@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -65,6 +66,12 @@ class InputFile(Wire):
     proof: str
     left: FrameFacts
     right: FrameFacts
+
+
+def folder_name(inputs: CycleInput) -> str:
+    """Sorts by time: 20260102T030405678Z-000012."""
+    captured_at = datetime.fromisoformat(inputs.pair.captured_at).astimezone(UTC)
+    return f"{captured_at:%Y%m%dT%H%M%S}{captured_at.microsecond // 1000:03d}Z-{inputs.cycle_id:06d}"
 
 
 def save(folder: Path, inputs: CycleInput, result: Result) -> None:
@@ -189,9 +196,8 @@ class Recorder:
     def _work(self) -> None:
         while (item := self._queue.get()) is not None:
             inputs, result = item
-            stamp = "".join(c for c in inputs.pair.captured_at if c.isalnum())
             try:
-                save(self._directory / f"{stamp}-{inputs.cycle_id:06d}", inputs, result)
+                save(self._directory / folder_name(inputs), inputs, result)
                 self._note(saved=1)
             except InputError as error:
                 self._note(failed=1, trouble=str(error))

@@ -20,6 +20,7 @@ import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from binpick import pipeline, recording
 from binpick import rig as rig_file
 from binpick.rig import Rig
 
@@ -172,7 +173,9 @@ def test_the_command_serves_a_cell_from_files_records_its_cycle_and_stops(tmp_pa
         ends_well(running, signal.SIGTERM)
     kept = list((tmp_path / "kept").iterdir())
     assert [path.name[-7:] for path in kept] == ["-000001"]
-    assert json.loads((kept[0] / "result.json").read_text())["return_code"]["value"] == 105
+    inputs, stored = recording.load(kept[0])
+    assert stored.return_code.value == 105
+    assert pipeline.run(inputs).result.timeless_bytes() == stored.timeless_bytes()
 
 
 def test_a_cell_that_cannot_be_served_is_one_line_and_exit_2(tmp_path: Path) -> None:

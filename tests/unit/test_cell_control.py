@@ -6,11 +6,13 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import pytest
 
-from binpick import settings
+from binpick import health, settings
+from binpick.camera.group import CameraGroup
 from binpick.cell import Cell
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import (
@@ -27,6 +29,7 @@ from binpick.errors import (
 from binpick.result import CycleInput, CycleResult, Request, Result, ReturnCode, Snapshot
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
+from binpick.sim.camera import SimCamera
 
 K = ((100.0, 0.0, 16.0), (0.0, 100.0, 12.0), (0.0, 0.0, 1.0))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -275,6 +278,42 @@ def test_dead_cameras_fail_the_cycle_by_name_then_are_opened_again() -> None:
             await until(cell, lambda s: s.phase == "ready")
             cell.start(Request(), "rest")
             await until(cell, lambda s: s.valid)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("fail", ["dead", "stuck"])
+def test_two_cameras_killed_in_mid_cycle_fail_it_within_two_seconds_by_name(fail: Literal["dead", "stuck"]) -> None:
+    exposing = threading.Event()
+
+    def sleep(seconds: float) -> None:
+        exposing.set()
+        time.sleep(seconds)
+
+    def expose(index: int, light: Light, shot: int) -> np.ndarray:
+        return np.zeros((24, 32), np.uint8)
+
+    async def scenario() -> None:
+        eyes = (SimCamera(0, expose, sleep=sleep), SimCamera(1, expose, sleep=sleep))
+        slow = cell_settings(recipes=[Recipe(frame="camera", exposure_us=300_000)])
+        cell = Cell(slow, rig(), CameraGroup(eyes, 5000.0), good, boot_id=7)
+        async with cell:
+            await until(cell, lambda s: s.phase == "ready")
+            cell.start(Request(), "rest")
+            await asyncio.to_thread(exposing.wait)
+            for eye in eyes:
+                eye.fail = fail
+            killed = time.monotonic()
+            shown = await until(cell, lambda s: s.valid)
+            assert time.monotonic() - killed < 2
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.CAMERAS
+            reasons = " ".join(health.judge(shown).reasons)
+            assert "camera left is down" in reasons
+            assert "camera right is down" in reasons
+            for eye in eyes:
+                eye.fail = ""
+            await until(cell, lambda s: s.phase == "ready", 15)
 
     asyncio.run(scenario())
 

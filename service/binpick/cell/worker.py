@@ -18,8 +18,8 @@ from binpick.recording import Recorder
 from binpick.result import CycleInput, CycleResult, Published, Result, failure
 from binpick.rig import Rig
 
-OPEN_LIMIT_S = 10.0
-"""For opening all cameras; a camera whose link just came up answers only after seconds."""
+OPEN_LIMIT_S = 5.0
+"""For one attempt to open all cameras: each needs about one second, a dead one two."""
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0)
 """Waits between attempts to open the cameras."""
 WATCH_S = 0.5
