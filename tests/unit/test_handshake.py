@@ -129,6 +129,7 @@ def test_before_the_control_word_was_written_nothing_is_ready() -> None:
 @pytest.mark.parametrize("levels", [TRIG, RES_ACK, TRIG | RES_ACK])
 def test_after_start_ready_waits_for_trig_and_res_ack_to_fall(levels: Ctrl) -> None:
     bench = Bench()
+    bench.look()
     assert bench.plc(ENABLE | levels, cmd_seq=3) == Status(0)
     assert bench.plc(ENABLE) == Status.READY
     assert bench.taken() == []
@@ -280,6 +281,11 @@ def test_valid_falls_with_a_code_when_the_cell_withdraws(done: Bench) -> None:
     assert done.cell(valid=False) == Status.ACK | Status.ACQ_DONE | Status.ERROR
     assert (done.shown.code, done.shown.detail) == (-26, Detail.WITHDRAWN)
     assert done.plc(ENABLE) == Status.READY | Status.ERROR
+
+
+def test_a_result_of_another_cycle_is_never_taken_for_mine(busy: Bench) -> None:
+    assert busy.cell(current=0, finished=2, code=0, valid=True, grasps=3) == Status.ACK | Status.ERROR
+    assert (busy.shown.code, busy.shown.detail) == (-26, Detail.WITHDRAWN)
 
 
 def test_triggering_again_replaces_an_unread_result(done: Bench) -> None:
