@@ -138,7 +138,8 @@ def test_pages_of_four() -> None:
     assert found == [*range(1, 10)]
 
 
-@pytest.mark.parametrize(("status", "code"), [(Status.BUSY, -12), (Status.ACK, 0), (Status.ERROR, -26), (VALID, 101), (VALID, -3)])
+@pytest.mark.parametrize(("status", "code"), [
+    (Status.BUSY, -12), (Status.ACK, 0), (Status.ERROR, -26), (VALID, 101), (VALID, -3)])
 def test_without_valid_and_a_good_code_there_are_no_poses(status: Status, code: int) -> None:
     words = image.encode(snapshot(3), signals(status=status, code=code))
     assert words[105] == code & 0xFFFF
