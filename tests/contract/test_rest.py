@@ -354,7 +354,7 @@ def test_a_waiting_client_is_let_go_when_the_cell_stops(free_port: int) -> None:
 
 def test_the_stored_description_is_current() -> None:
     stored = Path(__file__).parents[2] / "deploy" / "openapi.json"
-    assert stored.read_text() == rest.openapi_text(), "deploy/openapi.json is stale: run `make schema`"
+    assert stored.read_text() == rest.openapi_text(), "stale: deploy/openapi.json is rest.openapi_text()"
 
 
 # schemathesis chooses with the random module, which the seed below also sets

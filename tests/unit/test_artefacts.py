@@ -65,13 +65,14 @@ def cycle(code: Code = Code.OK, *grasps: GraspMessage) -> CycleResult:
     parts = np.zeros((HEIGHT // 2, WIDTH // 2), np.int32)
     parts[60:80, 60:90], parts[60:80, 100:140] = 1, 2
     half = np.zeros((*parts.shape, 3), np.float32)
+    segments = Segments(xyz=half, normal=half, faces=parts, parts=parts, part_points={}, part_confidence={1: 1.0, 2: 1.0})
     result = Result(cycle_id=3, request=Request(), captured_at="2026-01-02T03:04:05.678Z", return_code=ReturnCode.of(code),
                     bin=BinMessage(found=True, number=1, T_camera_bin=message(T_CAMERA_BIN), fill_level=0.2, coverage=0.9),
                     grasps=grasps)
     return CycleResult(
         result, Rectified(padded, padded, window, MARGIN, FOCAL, 0.15, 220.0, 160.0, T_CAMERA_RECT),
         Depth(disparity, np.nan_to_num(disparity), (measured * 255).astype(np.uint8), measured, 0.2),
-        OrganisedCloud(xyz, np.zeros(shape, np.float32), window), Segments(half, half, parts, parts, {1: 1.0, 2: 1.0}))
+        OrganisedCloud(xyz, np.zeros(shape, np.float32), window), segments)
 
 
 def grasp(T_frame_tcp: Transform, frame: FrameName, rank: int = 1) -> GraspMessage:
