@@ -5,7 +5,6 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SYSTEM := python3-venv python3-gi gir1.2-aravis-0.8 libgl1 libegl1 libx11-6 libusb-1.0-0 libudev1 libgomp1
 TEST_SYSTEM := chromium mbpoll
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
 ARGS ?=
 
 .PHONY: help demo test check bench lint schema install install-test clean
@@ -20,10 +19,10 @@ install: $(STAMP)  ## system packages and the virtual environment
 
 $(STAMP): pyproject.toml constraints.txt
 	@deploy/install-packages $(SYSTEM)
-	@test -x $(BIN)/python || /usr/bin/python3 -m venv --system-site-packages $(VENV)
-	@echo "Installing Python packages (about 1.5 GB on disk, 2 to 5 minutes) ..."
-	@$(PIP) --quiet --progress-bar on hatchling editables
-	@$(PIP) --progress-bar on --no-build-isolation --editable '.[sim,dev]' | grep -vE '^(Looking|Requirement already|Obtaining|  Preparing|  Getting|  Checking)' || test $${PIPESTATUS[0]} -eq 0
+	@test -x $(BIN)/pip || /usr/bin/python3 -m venv --system-site-packages $(VENV)
+	@echo "Installing Python packages (1.5 GB on disk, 2 to 5 minutes) ..."
+	@deploy/install-python $(VENV) hatchling editables
+	@deploy/install-python $(VENV) --no-build-isolation --editable '.[sim,dev]'
 	@touch $@
 
 install-test: $(STAMP)
@@ -43,8 +42,10 @@ test: install-test lint  ## everything that CI runs
 bench: $(STAMP)  ## accuracy and speed against the textbook pipeline, on the frozen exam
 	$(BIN)/binpick bench $(ARGS)
 
-schema: $(STAMP)  ## regenerate the generated files
-	$(BIN)/binpick schema --write deploy
+schema: $(STAMP)  ## regenerate the generated files of deploy/
+	$(BIN)/binpick schema >deploy/cell.schema.json
+	$(BIN)/python -c 'from binpick.publish import rest; print(rest.openapi_text(), end="")' >deploy/openapi.json
+	$(BIN)/python -c 'from binpick.publish import registers; print(registers.csv(), end="")' >deploy/register-map.csv
 
 clean:  ## remove what was installed and built
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache out
