@@ -81,9 +81,9 @@ class SimCamera:
     def _wait(self, until_ns: MonotonicNs, deadline_ns: MonotonicNs) -> None:
         while (left_s := remaining_s(until_ns, self._clock)) > 0:
             self._obey(deadline_ns)
-            if self._clock() >= deadline_ns:
+            if not (allowed_s := remaining_s(deadline_ns, self._clock)):
                 raise self._lost("did not deliver in time")
-            self._sleep(min(left_s, TICK_S))
+            self._sleep(min(left_s, allowed_s, TICK_S))
 
     def _obey(self, deadline_ns: MonotonicNs) -> None:
         """Fails as it was told to."""
