@@ -172,7 +172,10 @@ class Segments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grasp:
-    """A candidate while it is being judged; T_bin_tcp as in a published pose, z into the object."""
+    """A candidate while it is being judged; T_bin_tcp as in a published pose, z into the object.
+
+    `seal_m` is how far the lip must bend to follow the surface; `room` the share of the lip around which the part goes on.
+    """
 
     T_bin_tcp: Transform
     tool: int
@@ -180,7 +183,8 @@ class Grasp:
     open_m: float
     close_m: float
     quality: float
-    seal_rms_m: float
+    seal_m: float
+    room: float
     sigma_xy_m: float
     sigma_z_m: float
     sigma_tilt_rad: float

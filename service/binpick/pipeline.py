@@ -151,7 +151,7 @@ def _message(grasp: Grasp, inputs: CycleInput, T_frame_bin: Transform, number: i
     return GraspMessage(
         id=f"{inputs.cycle_id}-{number}", rank=number, tool=ToolMessage(number=tool.number, name=tool.name, kind=tool.kind),
         frame=inputs.request.frame or inputs.job.recipe.frame, **_pose(T_frame_tcp).model_dump(),
-        T_frame_pregrasp=_pose(T_frame_tcp @ geometry.translation(0, 0, -tool.approach_m)), approach_m=tool.approach_m,
+        T_frame_pregrasp=_pose(T_frame_tcp @ geometry.translation(0.0, 0.0, -tool.approach_m)), approach_m=tool.approach_m,
         lift_m=tool.lift_m, open_m=grasp.open_m, close_m=grasp.close_m, quality=grasp.quality, part_id=grasp.part_id,
         sigma=Sigma(xy_m=grasp.sigma_xy_m, z_m=grasp.sigma_z_m, tilt_rad=grasp.sigma_tilt_rad), clearance_m=grasp.clearance_m)
 

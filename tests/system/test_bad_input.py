@@ -73,7 +73,7 @@ def out_is_a_file(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "names"), [
-    (missing_image, ["left.png", "no such"]),
+    (missing_image, ["left.png", "No such file"]),
     (unreadable_image, ["left.png"]),
     (small_images, ["968x608", "1936x1216"]),
     (foreign_rig, ["rig.json", "binpick-rig"]),
@@ -114,14 +114,12 @@ def test_check_names_an_address_without_a_camera(files: Path) -> None:
 def test_check_names_a_camera_held_by_another_program(files: Path) -> None:
     image = np.zeros((1216, 1936), np.uint8)
     with GigePair(lambda _index, _light, _shot: image, ("127.0.33.2", "127.0.33.3")):
-        first = subprocess.Popen([sys.executable, "-c", HOLD, "127.0.33.2"], stdout=subprocess.PIPE, stdin=subprocess.PIPE)
-        try:
+        command = [sys.executable, "-W", "ignore", "-c", HOLD, "127.0.33.2"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE) as first:
             assert first.stdout is not None
             assert first.stdout.readline() == b"held\n"
             done = binpick("check", "--cell", files / "cell.yaml")
-        finally:
             first.kill()
-            first.wait()
     assert done.returncode == 3
     assert "another program" in " ".join(done.stdout.split())
 

@@ -7,8 +7,11 @@ import numpy as np
 from binpick.data import Grasp, Segments
 from binpick.settings import Tool
 
-WEIGHTS = {"height": 0.30, "seal": 0.30, "area": 0.15, "upright": 0.15, "centre": 0.10}
-"""Shares of the quality; they sum to 1. Height first frees the parts below."""
+WEIGHTS = {"height": 0.45, "area": 0.20, "upright": 0.20, "centre": 0.15}
+"""Shares of what is wanted; they sum to 1. Height frees the parts below."""
+DOUBTS = {"seal": 0.6, "room": 0.6}
+"""What a doubt may take away at most. Doubts multiply, as the part's confidence does: a high but doubtful spot must not win.
+Room around the lip forgives an edge that is measured a pixel off."""
 SAME_SPOT_M = 0.010
 SAME_TILT_RAD = np.radians(15)
 PER_PART = 2
@@ -27,12 +30,13 @@ def rank(grasps: list[Grasp], segments: Segments, tool: Tool) -> list[Grasp]:
         tilt = float(np.arccos(np.clip(-grasp.T_bin_tcp[2, 2], -1, 1)))
         terms = {
             "height": float(np.clip(grasp.T_bin_tcp[2, 3] / max(top, 1e-3), 0, 1)),
-            "seal": float(np.clip(1 - grasp.seal_rms_m / tool.compliance_m, 0, 1)),
             "area": float(np.sqrt(area_px[grasp.part_id] / largest)),
             "upright": 1 - tilt / max(tool.max_tilt_rad, 1e-6) if tool.max_tilt_rad else 1.0,
             "centre": float(np.clip(1 - offset / 0.03, 0, 1)),
         }
+        doubts = {"seal": min(1.0, grasp.seal_m / tool.compliance_m), "room": 1 - grasp.room}
         quality = segments.part_confidence[grasp.part_id] * sum(WEIGHTS[name] * value for name, value in terms.items())
+        quality *= float(np.prod([1 - DOUBTS[name] * value for name, value in doubts.items()]))
         scored.append(replace(grasp, quality=round(float(np.clip(quality, 0, 1)), 3)))
     return _distinct(sorted(scored, key=_key))
 

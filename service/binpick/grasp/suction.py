@@ -17,8 +17,8 @@ SKIRT_RADIUS = 1.5
 """Within this many lip radii nothing may stand out of the plane: there the cup's own body comes down."""
 STAND_OUT_M = 0.0015
 """What stands out further than this beside the lip keeps the cup from closing."""
-SEAL_SHARE = 0.85
-"""The measured surface may use this share of the compliance: the rest is for the measurement's own noise."""
+SEAL_SHARE = 0.95
+"""The measured surface may use this share of the compliance."""
 SECTORS = 16
 """The lip is judged in this many sectors; each must show the part."""
 CORRELATED_PX = 8.0
@@ -49,7 +49,8 @@ def candidates(segments: Segments, tool: Tool, sigma_z_m: Float32[np.ndarray, "h
     tilt = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1))
     limits = {
         "rim_not_on_one_part": seal.sectors >= SECTORS,
-        "no_seal": (seal.deviation_m <= SEAL_SHARE * tool.compliance_m) & (seal.stand_out_m <= STAND_OUT_M),
+        "no_seal": (np.maximum(seal.deviation_m, seal.bend_m) <= SEAL_SHARE * tool.compliance_m)
+                   & (seal.stand_out_m <= STAND_OUT_M),
         "tilt": tilt <= tool.max_tilt_rad,
     }
     alive = np.ones(len(spots), dtype=bool)
@@ -120,10 +121,11 @@ class Seal:
     slope: Float64[np.ndarray, "n 2"]
     level_m: Float64[np.ndarray, "n"]
     centre_m: Float64[np.ndarray, "n"]
-    rms_m: Float64[np.ndarray, "n"]
+    bend_m: Float64[np.ndarray, "n"]
     deviation_m: Float64[np.ndarray, "n"]
     stand_out_m: Float64[np.ndarray, "n"]
     sectors: Int32[np.ndarray, "n"]
+    room: Float64[np.ndarray, "n"]
     support: Int32[np.ndarray, "n"]
 
     def normal_bin(self, T_bin_spot: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 3"]:
@@ -138,6 +140,7 @@ def _seal(patch: Patch, radius_m: float) -> Seal:
     """Least-squares plane of the own points under the lip, and the residuals that matter.
 
     `deviation_m` is the 90th percentile of the lip zone's residuals: a maximum would be the noise's, not the surface's.
+    `bend_m` is how far the lip would have to follow the curvature alone: what a quadratic surface leaves of a plane.
     """
     x, y, z = (patch.local[..., a].astype(np.float64) for a in range(3))
     known = np.isfinite(z)
@@ -147,22 +150,28 @@ def _seal(patch: Patch, radius_m: float) -> Seal:
     slope, level = _fit_planes(x, y, z, under)
     residual = z - level[:, None] - slope[:, :1] * x - slope[:, 1:] * y
     lip = known & (radius >= 0.7 * radius_m) & (radius <= 1.15 * radius_m)
-    own_lip = lip & patch.own
+    around = known & (radius >= 1.15 * radius_m) & (radius <= SKIRT_RADIUS * radius_m)
     sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * SECTORS).astype(np.int32) % SECTORS
-    sectors = np.zeros(len(z), dtype=np.int32)
-    for s in range(SECTORS):
-        here = sector == s
-        own, others = (own_lip & here).sum(axis=1), (lip & here & ~patch.own).sum(axis=1)
-        sectors += (own >= 2) & (own >= 3 * others)
     skirt = known & (radius <= SKIRT_RADIUS * radius_m)
-    n = np.maximum(under.sum(axis=1), 1)
+    bend = _bend(x / radius_m, y / radius_m, residual, under)
     middle = under & (radius <= 0.4 * radius_m)
     return Seal(
-        slope=slope, level_m=level, sectors=sectors, support=under.sum(axis=1).astype(np.int32),
+        slope=slope, level_m=level, sectors=_held(sector, lip, patch.own), support=under.sum(axis=1).astype(np.int32),
         centre_m=np.where(middle, residual, 0).sum(axis=1) / np.maximum(middle.sum(axis=1), 1),
-        rms_m=np.sqrt(np.where(under, residual**2, 0).sum(axis=1) / n),
-        deviation_m=_quantile(np.abs(residual), under & (radius >= 0.6 * radius_m), 0.90),
+        room=_held(sector, around, patch.own) / SECTORS,
+        bend_m=bend, deviation_m=_quantile(np.abs(residual), under & (radius >= 0.6 * radius_m), 0.90),
         stand_out_m=_quantile(residual, skirt, 0.98))
+
+
+def _held(sector: Int32[np.ndarray, "n k"], zone: Bool[np.ndarray, "n k"], own: Bool[np.ndarray, "n k"],
+          ) -> Int32[np.ndarray, "n"]:
+    """In how many sectors of a zone around each spot the part's own points prevail."""
+    held = np.zeros(len(sector), dtype=np.int32)
+    for s in range(SECTORS):
+        here = zone & (sector == s)
+        mine, others = (here & own).sum(axis=1), (here & ~own).sum(axis=1)
+        held += (mine >= 2) & (mine >= 3 * others)
+    return held
 
 
 def _fit_planes(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], z: Float64[np.ndarray, "n k"],
@@ -173,6 +182,19 @@ def _fit_planes(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], z:
     right = np.einsum("nka,nk->na", columns, z)
     solved = np.linalg.solve(normal, right[..., None])[..., 0]
     return solved[:, :2], solved[:, 2]
+
+
+def _bend(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], residual: Float64[np.ndarray, "n k"],
+          under: Bool[np.ndarray, "n k"]) -> Float64[np.ndarray, "n"]:
+    """Amplitude on the lip (radius 1) of the best quadratic's saddle a x² + b x y + c y² about the plane; same unit as z.
+
+    A bowl (a = c, b = 0) costs the lip nothing, it only sits deeper; a cylinder of radius R costs r² / 4R.
+    """
+    columns = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=-1) * under[..., None]
+    normal = np.einsum("nka,nkb->nab", columns, columns) + np.eye(6) * 1e-6
+    a, b, c = np.linalg.solve(normal, np.einsum("nka,nk->na", columns, residual)[..., None])[:, :3, 0].T
+    amplitude: Float64[np.ndarray, "n"] = np.hypot((a - c) / 2, b / 2)
+    return amplitude
 
 
 def _quantile(values: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"], share: float) -> Float64[np.ndarray, "n"]:
@@ -206,5 +228,6 @@ def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Se
     independent = max(1.0, float(seal.support[i]) / CORRELATED_PX)
     radius_m = tool.cups[0].radius_m
     return Grasp(T_bin_tcp=T_bin_tcp, tool=tool.number, part_id=part, open_m=0.0, close_m=0.0, quality=0.0,
-                 seal_rms_m=float(seal.rms_m[i]), sigma_xy_m=sigma_px_m / 2, sigma_z_m=float(sigma_px_m / np.sqrt(independent)),
+                 seal_m=float(seal.bend_m[i]), room=float(seal.room[i]), sigma_xy_m=sigma_px_m / 2,
+                 sigma_z_m=float(sigma_px_m / np.sqrt(independent)),
                  sigma_tilt_rad=float(2 * sigma_px_m / radius_m / np.sqrt(independent)))
