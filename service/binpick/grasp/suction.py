@@ -166,12 +166,10 @@ def _seal(patch: Patch, radius_m: float) -> Seal:
 def _held(sector: Int32[np.ndarray, "n k"], zone: Bool[np.ndarray, "n k"], own: Bool[np.ndarray, "n k"],
           ) -> Int32[np.ndarray, "n"]:
     """In how many sectors of a zone around each spot the part's own points prevail."""
-    held = np.zeros(len(sector), dtype=np.int32)
-    for s in range(SECTORS):
-        here = zone & (sector == s)
-        mine, others = (here & own).sum(axis=1), (here & ~own).sum(axis=1)
-        held += (mine >= 2) & (mine >= 3 * others)
-    return held
+    bins = SECTORS * np.arange(len(sector))[:, None] + sector
+    mine, others = (np.bincount(bins[zone & whose], minlength=SECTORS * len(sector)).reshape(-1, SECTORS)
+                    for whose in (own, ~own))
+    return ((mine >= 2) & (mine >= 3 * others)).sum(axis=1).astype(np.int32)
 
 
 def _fit_planes(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], z: Float64[np.ndarray, "n k"],

@@ -47,7 +47,7 @@ def _links(surface: Surface, of_interest: Mask, settings: SegmentSettings, axis:
 
 
 def _dot(a: Cloud, b: Cloud) -> Float32[np.ndarray, "h w"]:
-    product: Float32[np.ndarray, "h w"] = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    product: Float32[np.ndarray, "h w"] = cv2.transform(a * b, np.ones((1, 3), dtype=np.float32))
     return product
 
 

@@ -1,7 +1,7 @@
 """The measured surface at half resolution: points and edge-preserving normals in the bin's frame.
 
 On a plane 1/z, and so disparity, is affine in the pixel coordinates; a plane fit in disparity is linear and its noise is
-even. Each pixel takes the fit of the window around it, of nine, that fits best, so a window across an edge never wins.
+even. Each pixel takes the fit of the window around it, of five, that fits best, so a window across an edge never wins.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,8 @@ RADIUS = 3
 """Half side of a fit window, half-resolution px: 7x7 are about 8 mm at 1 m."""
 SUPPORT = 0.5
 """Least share of measured pixels in a fit window."""
+WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RADIUS, RADIUS))
+"""Where the fit windows around a pixel are centred (row, column): on it, or with it at their corner."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,18 +71,21 @@ def _planes(disparity: Field) -> tuple[Field, Field, Field]:
     """Slopes per half-resolution px and level of the best plane at each measured pixel; NaN where none has support."""
     known = np.isfinite(disparity)
     slope_u, slope_v, level, misfit = _fits(disparity, known)
-    best = np.full(disparity.shape, np.inf, dtype=np.float32)
-    out = [np.full(disparity.shape, np.nan, dtype=np.float32) for _ in range(3)]
-    for dv in (0, -RADIUS, RADIUS):
-        for du in (0, -RADIUS, RADIUS):
-            error = _shift(misfit, du, dv, np.inf)
-            better = error < best
-            best = np.where(better, error, best)
-            a, b = _shift(slope_u, du, dv, np.nan), _shift(slope_v, du, dv, np.nan)
-            here = _shift(level, du, dv, np.nan) - a * du - b * dv
-            for target, value in zip(out, (a, b, here), strict=True):
-                np.copyto(target, value, where=better & known)
-    return out[0], out[1], out[2]
+    rows, cols = disparity.shape
+    framed = np.pad(misfit, RADIUS, constant_values=np.inf)
+    errors = [framed[RADIUS + dv:RADIUS + dv + rows, RADIUS + du:RADIUS + du + cols] for dv, du in WINDOWS]
+    best, choice = errors[0].copy(), np.zeros(disparity.shape, dtype=np.int8)
+    for k, error in enumerate(errors[1:], 1):
+        choice[error < best] = k
+        np.minimum(best, error, out=best)
+    found = np.flatnonzero(known & np.isfinite(best))
+    dv, du = np.array(WINDOWS, dtype=np.int32)[choice.ravel()[found]].T
+    source = found + dv * cols + du
+    planes = [np.full(disparity.size, np.nan, dtype=np.float32) for _ in range(3)]
+    a, b = slope_u.ravel()[source], slope_v.ravel()[source]
+    planes[0][found], planes[1][found] = a, b
+    planes[2][found] = level.ravel()[source] - a * du - b * dv
+    return planes[0].reshape(rows, cols), planes[1].reshape(rows, cols), planes[2].reshape(rows, cols)
 
 
 def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
@@ -114,12 +119,3 @@ def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
     level = mean_d - a * mean_u - b * mean_v + mid
     a, b, level = (np.where(usable, field, np.nan) for field in (a, b, level))
     return a.astype(np.float32), b.astype(np.float32), level.astype(np.float32), misfit.astype(np.float32)
-
-
-def _shift(field: Field, du: int, dv: int, outside: float) -> Field:
-    """The field's value at (u + du, v + dv)."""
-    moved = np.full_like(field, outside)
-    rows, cols = field.shape
-    moved[max(0, -dv):rows - max(0, dv), max(0, -du):cols - max(0, du)] = (
-        field[max(0, dv):rows - max(0, -dv), max(0, du):cols - max(0, -du)])
-    return moved

@@ -34,9 +34,18 @@ def sgbm(settings: StereoSettings, num_disparities: int, min_disparity: int = 0)
 
 
 def match(rectified: Rectified, settings: StereoSettings) -> Matched:
-    """Left and right disparity of the window; the search range is the window's."""
+    """Left and right disparity of the window; the search range is the window's.
+
+    The right view only confirms or denies the left one, within 1.5 px, so it is matched at half resolution: an eighth of the
+    work for the same verdicts.
+    """
     left_matcher = sgbm(settings, rectified.window.num_disparities)
-    right_matcher = cv2.ximgproc.createRightMatcher(left_matcher)
     left = left_matcher.compute(rectified.left, rectified.right)
-    right = right_matcher.compute(rectified.right, rectified.left)
+    rows, cols = rectified.left.shape
+    half_left, half_right = (cv2.resize(image, (cols // 2, rows // 2), interpolation=cv2.INTER_AREA)
+                             for image in (rectified.left, rectified.right))
+    half_range = 16 * ((rectified.window.num_disparities + 31) // 32)
+    right_matcher = cv2.ximgproc.createRightMatcher(sgbm(settings, half_range))
+    half = right_matcher.compute(half_right, half_left)
+    right = 2 * cv2.resize(half, (cols, rows), interpolation=cv2.INTER_NEAREST)
     return Matched(left=np.asarray(left, dtype=np.int16), right=np.asarray(right, dtype=np.int16), matcher=left_matcher)
