@@ -22,8 +22,8 @@ PAD_M = 0.08
 """How far beyond the bin the rim's height is kept: as wide as a tool."""
 SIDE_STEP_M = 0.004
 """Vertical distance of the points that stand for the sides of the solid."""
-SWEEP_STEP_M = 0.010
-"""Distance of the tool's checked positions along the approach; the bodies are long in that direction."""
+SWEEP_STEP_M = 0.015
+"""Distance of the tool's checked positions along the approach: less than any body is long in that direction."""
 HORIZON_M = 0.020
 """Clearances above this are reported as this."""
 CONTACT_M = 0.003

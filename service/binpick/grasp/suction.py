@@ -45,20 +45,17 @@ def candidates(segments: Segments, tool: Tool, sigma_z_m: Float32[np.ndarray, "h
     if not len(spots):
         return [], reasons
     patch, T_bin_spot = _patches(segments, spots, cup.radius_m)
-    seal = _seal(patch, cup.radius_m)
-    tilt = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1))
-    limits = {
-        "rim_not_on_one_part": seal.sectors >= SECTORS,
-        "no_seal": (np.maximum(seal.deviation_m, seal.bend_m) <= SEAL_SHARE * tool.compliance_m)
-                   & (seal.stand_out_m <= STAND_OUT_M),
-        "tilt": tilt <= tool.max_tilt_rad,
-    }
-    alive = np.ones(len(spots), dtype=bool)
-    for reason, passed in limits.items():
-        reasons[reason] = int((alive & ~passed).sum())
-        alive &= passed
+    on_one_part = _sectors(patch, 0.7 * cup.radius_m, 1.15 * cup.radius_m) == SECTORS
+    reasons["rim_not_on_one_part"] = int((~on_one_part).sum())
+    spots, T_bin_spot = spots[on_one_part], T_bin_spot[on_one_part]
+    seal = _seal(Patch(patch.local[on_one_part], patch.own[on_one_part]), cup.radius_m)
+    limit_m = SEAL_SHARE * tool.compliance_m
+    sealed = (np.maximum(seal.deviation_m, seal.bend_m) <= limit_m) & (seal.stand_out_m <= STAND_OUT_M)
+    upright = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1)) <= tool.max_tilt_rad
+    reasons |= {"no_seal": int((~sealed).sum()), "tilt": int((sealed & ~upright).sum())}
     long_axes = _long_axes(segments)
-    grasps = [_grasp(i, segments, spots, seal, T_bin_spot, long_axes, tool, sigma_z_m) for i in np.flatnonzero(alive).tolist()]
+    grasps = [_grasp(i, segments, spots, seal, T_bin_spot, long_axes, tool, sigma_z_m)
+              for i in np.flatnonzero(sealed & upright).tolist()]
     reasons["sealed"] = len(grasps)
     return grasps, reasons
 
@@ -124,7 +121,6 @@ class Seal:
     bend_m: Float64[np.ndarray, "n"]
     deviation_m: Float64[np.ndarray, "n"]
     stand_out_m: Float64[np.ndarray, "n"]
-    sectors: Int32[np.ndarray, "n"]
     room: Float64[np.ndarray, "n"]
     support: Int32[np.ndarray, "n"]
 
@@ -149,37 +145,45 @@ def _seal(patch: Patch, radius_m: float) -> Seal:
     under = known & patch.own & (radius <= FIT_RADIUS * radius_m) & (np.abs(z) < radius_m)
     slope, level = _fit_planes(x, y, z, under)
     residual = z - level[:, None] - slope[:, :1] * x - slope[:, 1:] * y
-    lip = known & (radius >= 0.7 * radius_m) & (radius <= 1.15 * radius_m)
-    around = known & (radius >= 1.15 * radius_m) & (radius <= SKIRT_RADIUS * radius_m)
-    sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * SECTORS).astype(np.int32) % SECTORS
     skirt = known & (radius <= SKIRT_RADIUS * radius_m)
     bend = _bend(x / radius_m, y / radius_m, residual, under)
     middle = under & (radius <= 0.4 * radius_m)
     return Seal(
-        slope=slope, level_m=level, sectors=_held(sector, lip, patch.own), support=under.sum(axis=1).astype(np.int32),
+        slope=slope, level_m=level, support=under.sum(axis=1).astype(np.int32),
         centre_m=np.where(middle, residual, 0).sum(axis=1) / np.maximum(middle.sum(axis=1), 1),
-        room=_held(sector, around, patch.own) / SECTORS,
+        room=_sectors(patch, 1.15 * radius_m, SKIRT_RADIUS * radius_m) / SECTORS,
         bend_m=bend, deviation_m=_quantile(np.abs(residual), under & (radius >= 0.6 * radius_m), 0.90),
         stand_out_m=_quantile(residual, skirt, 0.98))
 
 
-def _held(sector: Int32[np.ndarray, "n k"], zone: Bool[np.ndarray, "n k"], own: Bool[np.ndarray, "n k"],
-          ) -> Int32[np.ndarray, "n"]:
-    """In how many sectors of a zone around each spot the part's own points prevail."""
-    bins = SECTORS * np.arange(len(sector))[:, None] + sector
-    mine, others = (np.bincount(bins[zone & whose], minlength=SECTORS * len(sector)).reshape(-1, SECTORS)
-                    for whose in (own, ~own))
-    return ((mine >= 2) & (mine >= 3 * others)).sum(axis=1).astype(np.int32)
+def _sectors(patch: Patch, inner_m: float, outer_m: float) -> Int32[np.ndarray, "n"]:
+    """In how many sectors of a ring around each spot the part's own points prevail."""
+    x, y = patch.local[..., 0], patch.local[..., 1]
+    radius = np.hypot(x, y)
+    with np.errstate(invalid="ignore"):
+        ring = (radius >= inner_m) & (radius <= outer_m)
+    sector = np.floor((np.arctan2(y[ring], x[ring]) + np.pi) * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
+    bins = SECTORS * np.nonzero(ring)[0] + sector
+    own = patch.own[ring]
+    mine, others = (np.bincount(bins[whose], minlength=SECTORS * len(x)).reshape(-1, SECTORS) for whose in (own, ~own))
+    held: Int32[np.ndarray, "n"] = ((mine >= 2) & (mine >= 3 * others)).sum(axis=1).astype(np.int32)
+    return held
 
 
 def _fit_planes(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], z: Float64[np.ndarray, "n k"],
                 under: Bool[np.ndarray, "n k"]) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n"]]:
     """z = level + slope · (x, y) by normal equations; a microscopic ridge (1 µm²) keeps spots without points solvable."""
-    columns = np.stack([x, y, np.ones_like(x)], axis=-1) * under[..., None]
-    normal = np.einsum("nka,nkb->nab", columns, columns) + np.eye(3) * 1e-12
-    right = np.einsum("nka,nk->na", columns, z)
-    solved = np.linalg.solve(normal, right[..., None])[..., 0]
+    solved = _least_squares(np.stack([x, y, np.ones_like(x)], axis=-1), z, under, 1e-12)
     return solved[:, :2], solved[:, 2]
+
+
+def _least_squares(columns: Float64[np.ndarray, "n k c"], z: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"],
+                   ridge: float) -> Float64[np.ndarray, "n c"]:
+    """Coefficients of z in the columns over each row's selected points; the ridge keeps rows with too few solvable."""
+    chosen = (columns * of[..., None]).transpose(0, 2, 1)
+    normal = chosen @ columns + np.eye(columns.shape[2]) * ridge
+    solved: Float64[np.ndarray, "n c"] = np.linalg.solve(normal, chosen @ z[..., None])[..., 0]
+    return solved
 
 
 def _bend(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], residual: Float64[np.ndarray, "n k"],
@@ -188,9 +192,8 @@ def _bend(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], residual
 
     A bowl (a = c, b = 0) costs the lip nothing, it only sits deeper; a cylinder of radius R costs r² / 4R.
     """
-    columns = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=-1) * under[..., None]
-    normal = np.einsum("nka,nkb->nab", columns, columns) + np.eye(6) * 1e-6
-    a, b, c = np.linalg.solve(normal, np.einsum("nka,nk->na", columns, residual)[..., None])[:, :3, 0].T
+    columns = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=-1)
+    a, b, c = _least_squares(columns, residual, under, 1e-6)[:, :3].T
     amplitude: Float64[np.ndarray, "n"] = np.hypot((a - c) / 2, b / 2)
     return amplitude
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from binpick import geometry
 from binpick.data import Cloud, Depth, Mask, Rectified
@@ -91,17 +91,17 @@ def _planes(disparity: Field) -> tuple[Field, Field, Field]:
 def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
     """Least-squares planes of the windows centred on every pixel, by box sums; misfit is inf without support.
 
-    Sums run in float64: the misfit is a small difference of large squares.
+    float32 suffices around the median disparity: with |d| < 40 px the misfit, a difference of squares, is good to 1e-4 px².
     """
     mid = float(np.nanmedian(disparity)) if known.any() else 0.0
-    d = np.where(known, disparity - np.float32(mid), np.float32(0)).astype(np.float64)
-    w = known.astype(np.float64)
-    ones = np.ones(2 * RADIUS + 1)
-    ramp = np.arange(-RADIUS, RADIUS + 1, dtype=np.float64)
+    d = np.where(known, disparity - np.float32(mid), np.float32(0))
+    w = known.astype(np.float32)
+    ones = np.ones(2 * RADIUS + 1, dtype=np.float32)
+    ramp = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
 
-    def window(field: Float64[np.ndarray, "h w"], along_u: Float64[np.ndarray, "k"],
-               along_v: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "h w"]:
-        return np.asarray(cv2.sepFilter2D(field, cv2.CV_64F, along_u, along_v, borderType=cv2.BORDER_CONSTANT))
+    def window(field: Field, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Field:
+        summed: Field = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
+        return summed
 
     n = np.maximum(window(w, ones, ones), 1)
     mean_u, mean_v, mean_d = window(w, ramp, ones) / n, window(w, ones, ramp) / n, window(d, ones, ones) / n
@@ -113,9 +113,8 @@ def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
     dd = window(d * d, ones, ones) / n - mean_d**2
     det = uu * vv - uv * uv
     usable = (n >= SUPPORT * ones.size**2) & (det > 0.5)
-    det = np.where(usable, det, 1)
+    det[~usable] = np.nan
     a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
-    misfit = np.where(usable, np.maximum(dd - a * ud - b * vd, 0), np.inf)
-    level = mean_d - a * mean_u - b * mean_v + mid
-    a, b, level = (np.where(usable, field, np.nan) for field in (a, b, level))
-    return a.astype(np.float32), b.astype(np.float32), level.astype(np.float32), misfit.astype(np.float32)
+    misfit = np.maximum(dd - a * ud - b * vd, np.float32(0))
+    misfit[~usable] = np.inf
+    return a, b, mean_d - a * mean_u - b * mean_v + np.float32(mid), misfit

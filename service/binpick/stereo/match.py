@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Int16
+from jaxtyping import Int16, UInt8
 
 from binpick.data import Rectified
 from binpick.settings import StereoSettings
@@ -15,11 +15,17 @@ SCALE = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """Raw disparities in 1/16 px of both views, margin included, relative to the window's smallest disparity."""
+    """Raw disparities in 1/16 px, margin included, relative to the window's smallest disparity; negative: not matched.
+
+    The right view only confirms or denies the left one, within 1.5 px, so it is matched at half resolution, an eighth of the
+    work for the same verdicts. `half_left` is the left disparity and `half_guide` the left image on that grid.
+    """
 
     left: Int16[np.ndarray, "h w"]
-    right: Int16[np.ndarray, "h w"]
-    matcher: cv2.StereoSGBM
+    half_left: Int16[np.ndarray, "h2 w2"]
+    half_right: Int16[np.ndarray, "h2 w2"]
+    half_guide: UInt8[np.ndarray, "h2 w2"]
+    half_matcher: cv2.StereoSGBM
 
 
 def sgbm(settings: StereoSettings, num_disparities: int, min_disparity: int = 0) -> cv2.StereoSGBM:
@@ -34,18 +40,12 @@ def sgbm(settings: StereoSettings, num_disparities: int, min_disparity: int = 0)
 
 
 def match(rectified: Rectified, settings: StereoSettings) -> Matched:
-    """Left and right disparity of the window; the search range is the window's.
-
-    The right view only confirms or denies the left one, within 1.5 px, so it is matched at half resolution: an eighth of the
-    work for the same verdicts.
-    """
-    left_matcher = sgbm(settings, rectified.window.num_disparities)
-    left = left_matcher.compute(rectified.left, rectified.right)
-    rows, cols = rectified.left.shape
-    half_left, half_right = (cv2.resize(image, (cols // 2, rows // 2), interpolation=cv2.INTER_AREA)
+    """Left and right disparity of the window; the search range is the window's."""
+    left = np.asarray(sgbm(settings, rectified.window.num_disparities).compute(rectified.left, rectified.right), dtype=np.int16)
+    rows, cols = left.shape[0] // 2, left.shape[1] // 2
+    half_left, half_right = (cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
                              for image in (rectified.left, rectified.right))
-    half_range = 16 * ((rectified.window.num_disparities + 31) // 32)
-    right_matcher = cv2.ximgproc.createRightMatcher(sgbm(settings, half_range))
-    half = right_matcher.compute(half_right, half_left)
-    right = 2 * cv2.resize(half, (cols, rows), interpolation=cv2.INTER_NEAREST)
-    return Matched(left=np.asarray(left, dtype=np.int16), right=np.asarray(right, dtype=np.int16), matcher=left_matcher)
+    half_matcher = sgbm(settings, 16 * ((rectified.window.num_disparities + 31) // 32))
+    right = cv2.ximgproc.createRightMatcher(half_matcher).compute(half_right, half_left)
+    return Matched(left=left, half_left=left[:2 * rows:2, :2 * cols:2] // 2, half_right=np.asarray(right, dtype=np.int16),
+                   half_guide=np.asarray(half_left, dtype=np.uint8), half_matcher=half_matcher)
