@@ -59,10 +59,10 @@ def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
     local = geometry.transform(geometry.inverse(grasp.T_bin_tcp), _beneath(grasp.T_bin_tcp, tool, scene))
     radial = np.hypot(local[:, 0], local[:, 1])
     touched = (local[:, 2] > -CONTACT_M) & (radial < _foot_radius_m(tool) + HORIZON_M / 4)
-    local = local[~touched]
+    local = local[~touched & _near_bodies(local, tool, tool.approach_m)]
     # the tool standing back by s is the scene standing forward by s
     swept = (local[None] - _backs(tool)[:, None]).reshape(-1, 3)
-    near = swept[_near_bodies(swept, tool)]
+    near = swept[_near_bodies(swept, tool, 0.0)]
     if not len(near):
         return HORIZON_M
     distance = _solid(tool).compute_signed_distance(o3d.core.Tensor.from_numpy(near.astype(np.float32))).numpy()
@@ -115,12 +115,12 @@ def _foot_radius_m(tool: Tool) -> float:
     return max([tool.cups[0].radius_m] + [r for r, _, high in map(_extent, tool.bodies) if high > -0.01])
 
 
-def _near_bodies(points: Float64[np.ndarray, "n 3"], tool: Tool) -> Bool[np.ndarray, "n"]:
-    """Points within HORIZON_M of some body's bounding cylinder about the TCP's axis."""
+def _near_bodies(points: Float64[np.ndarray, "n 3"], tool: Tool, sweep_m: float) -> Bool[np.ndarray, "n"]:
+    """Points within HORIZON_M of some body's bounding cylinder about the TCP's axis, swept back by `sweep_m`."""
     radial = np.hypot(points[:, 0], points[:, 1])
     near = np.zeros(len(points), dtype=bool)
     for radius, low, high in map(_extent, tool.bodies):
-        near |= (radial < radius + HORIZON_M) & (points[:, 2] > low - HORIZON_M) & (points[:, 2] < high + HORIZON_M)
+        near |= (radial < radius + HORIZON_M) & (points[:, 2] > low - HORIZON_M - sweep_m) & (points[:, 2] < high + HORIZON_M)
     return near
 
 

@@ -1,7 +1,8 @@
 """The textbook pipeline, plainly written: what one gets by following the tutorials, to measure ours against.
 
 Full frame, a fixed range of 352 disparities, SGBM with right matcher and WLS, reprojection, then Open3D: voxels, normals, the
-floor by RANSAC, clusters by DBSCAN, a plane per cluster, a grasp on the middle of the highest one. Given a window and range it
+floor by RANSAC, clusters by DBSCAN, a plane per cluster, a grasp on the middle of the highest one
+that is not too steep. Given a window and range it
 runs on those instead (the third row of the table).
 """
 
@@ -21,6 +22,10 @@ from binpick.settings import Bin
 from binpick.stereo import rectify
 
 DISPARITIES = 352
+WALLS_M = 0.015
+"""Cut off along the walls: the smoothed map climbs them in ramps."""
+STEEP_RAD = 0.6
+"""Planes steeper than the tool may tilt are not grasped, as ours are not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +85,7 @@ def _grasps(points: Float32[np.ndarray, "n 3"], model: Bin) -> list[Transform]:
         return []
     length, width, _ = model.inner_size_m
     inside = o3d.geometry.AxisAlignedBoundingBox(
-        [-length / 2 + 0.005, -width / 2 + 0.005, -0.02], [length / 2 - 0.005, width / 2 - 0.005, 0.5]
+        [-length / 2 + WALLS_M, -width / 2 + WALLS_M, -0.02], [length / 2 - WALLS_M, width / 2 - WALLS_M, 0.5]
     )
     cloud = cloud.crop(inside)
     if len(cloud.points) < 100:
@@ -95,6 +100,8 @@ def _grasps(points: Float32[np.ndarray, "n 3"], model: Bin) -> list[Transform]:
             continue
         plane, inliers = cluster.segment_plane(0.0015, 3, 200)
         normal = np.array(plane[:3]) * (1 if plane[2] > 0 else -1)
+        if normal[2] < np.cos(STEEP_RAD):
+            continue
         centre = np.asarray(cluster.points)[inliers].mean(axis=0)
         grasps.append(geometry.frame_of_axes(-normal, np.array([1.0, 0, 0]), centre))
     return sorted(grasps, key=lambda T: -T[2, 3])

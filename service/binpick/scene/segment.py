@@ -2,7 +2,8 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32
+from scipy import ndimage
 
 from binpick.data import Labels, Mask, Segments, frozen
 from binpick.scene import euclid, grid
@@ -22,7 +23,7 @@ def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSetti
     spacing_m = _spacing(surface, of_interest)
     least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
     faces, parts = _drop_small(faces, least), _drop_small(parts, least)
-    masks = {label: (box, parts[box] == label) for label, box in _boxes(parts).items()}
+    masks = {label: (box, parts[box] == label) for label, box in enumerate(ndimage.find_objects(parts), 1)}
     points = {label: surface.xyz[box][mask] for label, (box, mask) in masks.items()}
     return Segments(xyz=frozen(surface.xyz), normal=frozen(surface.normal), faces=frozen(faces), parts=frozen(parts),
                     part_points=points,
@@ -41,7 +42,8 @@ def _inside(surface: Surface, model: Bin) -> Mask:
 
 def _spacing(surface: Surface, of_interest: Mask) -> float:
     """Median distance of neighbouring points, metres; 0 when there are none."""
-    step = np.linalg.norm(surface.xyz[:, 1:] - surface.xyz[:, :-1], axis=-1)[of_interest[:, 1:] & of_interest[:, :-1]]
+    both = of_interest[:, 1:] & of_interest[:, :-1]
+    step = np.linalg.norm(surface.xyz[:, 1:][both] - surface.xyz[:, :-1][both], axis=-1)
     return float(np.median(step)) if step.size else 0.0
 
 
@@ -66,17 +68,3 @@ def _confidence(points: Float32[np.ndarray, "n 3"], mask: Mask, part: PartSize) 
     hull = cv2.convexHull(np.concatenate(outline))
     solidity = float(mask.sum()) / max(float(cv2.contourArea(hull)), float(mask.sum()), 1.0)
     return round(float(np.clip(2 - max(a, b) / part.max_size_m, 0.1, 1)) * (0.4 + 0.6 * solidity), 4)
-
-
-def _boxes(labels: Labels) -> dict[int, tuple[slice, slice]]:
-    """The pixel box of every label."""
-    rows, cols = np.nonzero(labels)
-    values: Int32[np.ndarray, "n"] = labels[rows, cols]
-    count = int(values.max()) if values.size else 0
-    box: Float64[np.ndarray, "4 n"] = np.array([np.full(count + 1, np.inf), np.full(count + 1, -1.0)] * 2)
-    np.minimum.at(box[0], values, rows)
-    np.maximum.at(box[1], values, rows)
-    np.minimum.at(box[2], values, cols)
-    np.maximum.at(box[3], values, cols)
-    return {i: (slice(int(box[0, i]), int(box[1, i]) + 1), slice(int(box[2, i]), int(box[3, i]) + 1))
-            for i in range(1, count + 1) if box[1, i] >= 0}

@@ -44,10 +44,11 @@ def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surf
     # a u + b v + c = f b / z  =>  n ~ (a f, b f, a (u - cx) .. + c) with u, v counted from the principal point
     a, b = slope_u / 2, slope_v / 2
     c = level - a * u[None, :] - b * v[:, None]
-    normal = np.stack([a * f, b * f, c], axis=-1)
-    normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
+    a, b = a * f, b * f
+    towards = -1 / np.sqrt(a * a + b * b + c * c)
+    normal = cv2.merge([a * towards, b * towards, c * towards])
     z = np.float32(rectified.focal_px * rectified.baseline_m) / disparity
-    rect = np.stack([z * u[None, :] / f, z * v[:, None] / f, z], axis=-1)
+    rect = cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z])
     T_bin_rect = T_bin_camera @ rectified.T_camera_rect
     sigma = z * z * np.float32(depth.sigma_px / (rectified.focal_px * rectified.baseline_m))
     return Surface(xyz=geometry.transform(T_bin_rect, rect), normal=geometry.rotate(T_bin_rect, normal), sigma_z_m=sigma)
