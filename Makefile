@@ -42,10 +42,11 @@ test: install-test lint  ## everything that CI runs
 bench: $(STAMP)  ## accuracy and speed against the textbook pipeline, on the frozen exam
 	$(BIN)/binpick bench $(ARGS)
 
-schema: $(STAMP)  ## regenerate the generated files of deploy/
+schema: $(STAMP)  ## regenerate the generated files of deploy/ and the list of modules in DECISIONS
 	$(BIN)/binpick schema >deploy/cell.schema.json
 	$(BIN)/python -c 'from binpick.publish import rest; print(rest.openapi_text(), end="")' >deploy/openapi.json
 	$(BIN)/python -c 'from binpick.publish import registers; print(registers.csv(), end="")' >deploy/register-map.csv
+	$(BIN)/python tests/unit/test_house.py
 
 clean:  ## remove what was installed and built
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache out
