@@ -51,6 +51,7 @@ def test_the_recipes_speak_two_formats_in_the_robots_frame():
 def test_mixed_means_equal_shares():
     assert set(Counter(exam.kinds("mixed", 25)).values()) == {5}
     assert exam.kinds("bolt", 2) == ("bolt", "bolt")
+    assert exam.kinds("block+tee", 3) == ("block", "tee", "block")
 
 
 def test_unknown_names_say_what_there_is():
@@ -58,6 +59,8 @@ def test_unknown_names_say_what_there_is():
         exam.rig("C")
     with pytest.raises(InputError, match="block"):
         exam.kinds("brick", 1)
+    with pytest.raises(InputError, match="'brick'"):
+        exam.kinds("block+brick", 0)
 
 
 def test_the_checksum_follows_the_tables(monkeypatch):

@@ -54,6 +54,15 @@ def test_the_projector_gives_texture_where_there_is_none(renderer, scene):
     assert pattern > 3 * plain
 
 
+def test_an_empty_bin_has_a_picture_too(renderer, scene):
+    empty = WorldScene("A", (), 5, 2)
+    difference = cv2.absdiff(renderer.radiance(scene, 0, True), renderer.radiance(empty, 0, True))
+    # where no part lay, nothing changes; noise is the shot's
+    assert (difference[550:700, 850:1150] > 0.02).any()
+    assert difference[:200].max() < 1e-6
+    assert renderer.expose(empty, 0, PATTERN, 1).mean() > 30
+
+
 def test_it_looks_into_one_world_only(renderer):
     with pytest.raises(ValueError, match="world A"):
         renderer.radiance(WorldScene("B", (), 1, 1), 0, True)

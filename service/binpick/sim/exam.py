@@ -152,12 +152,11 @@ def setup(name: str) -> Setup:
 
 
 def kinds(mixture: str, count: int) -> tuple[str, ...]:
-    """The kinds of `count` parts: all of one kind, or "mixed" for equal shares. Raises InputError."""
-    if mixture == "mixed":
-        return tuple(list(KINDS)[i % len(KINDS)] for i in range(count))
-    if mixture not in KINDS:
-        raise InputError(f"there is no kind of part {mixture!r}; there are mixed, {', '.join(KINDS)}")
-    return (mixture,) * count
+    """The kinds of `count` parts in equal shares: of one kind, of some as "block+tee", or "mixed" of all. Raises InputError."""
+    chosen = list(KINDS) if mixture == "mixed" else mixture.split("+")
+    if unknown := [kind for kind in chosen if kind not in KINDS]:
+        raise InputError(f"there is no kind of part {unknown[0]!r}; there are mixed, {', '.join(KINDS)}")
+    return tuple(chosen[i % len(chosen)] for i in range(count))
 
 
 def rig(world: str) -> Rig:

@@ -38,8 +38,10 @@ class Projector:
 def sample(image: Float32[np.ndarray, "h w"], u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"],
            border: int) -> Float32[np.ndarray, "n"]:
     """The image at sub-pixel places (column u, row v), linearly between its cells."""
-    # remap works on grids: the list is folded into rows and its last row filled up
     count = len(u)
+    if not count:
+        return np.zeros(0, np.float32)
+    # remap works on grids: the list is folded into rows and its last row filled up
     u, v = (np.append(axis, np.zeros(-len(axis) % ROW, np.float32)).reshape(-1, ROW) for axis in (u, v))
     values: Float32[np.ndarray, "n"] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=border).ravel()[:count]
     return values

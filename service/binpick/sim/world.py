@@ -58,7 +58,7 @@ class World:
     """Drops `count` parts into the bin of exam world `name` and lets them settle; same arguments, same world."""
 
     def __init__(self, name: str, kinds: str, count: int, seed: int) -> None:
-        """`kinds`: one kind of `exam.KINDS`, or "mixed". Raises InputError."""
+        """`kinds` as in `exam.kinds`. Raises InputError."""
         self._setup = exam.setup(name)
         self._seed = seed
         self._revision = 0
