@@ -96,7 +96,8 @@ class AravisCamera:
         try:
             return self._owner.call(function, deadline_ns)
         except TimeoutError:
-            raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}", self._name)) from None
+            raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}: check its power, cable and "
+                                        "network", self._name)) from None
         except CameraError as error:
             raise self._fail(error) from None
 

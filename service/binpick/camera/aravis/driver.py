@@ -160,7 +160,8 @@ class Driver:
         while True:
             buffer = stream.timeout_pop_buffer(int(max(0.0, remaining_s(deadline_ns) - POP_MARGIN_S) * 1e6))
             if buffer is None:
-                raise CameraLost(f"camera {self._name} took the trigger but sent no image", self._name)
+                raise CameraLost(f"camera {self._name} took the trigger but sent no image: check its power, cable and network",
+                                 self._name)
             try:
                 if self._behind(buffer.get_frame_id()) == 0:
                     return self._frame(buffer, sequence), self._clock()
@@ -209,7 +210,8 @@ class Driver:
         if error.code in (kind.FEATURE_NOT_FOUND, kind.WRONG_FEATURE, kind.INVALID_PARAMETER,
                           kind.PROTOCOL_ERROR_INVALID_PARAMETER):
             return CameraError(f"camera {self._name} does not accept {doing}: {error.message}", self._name)
-        return CameraLost(f"camera {self._name} failed while {doing}: {error.message}", self._name)
+        return CameraLost(f"camera {self._name} failed while {doing} ({error.message}): check its power, cable and network",
+                          self._name)
 
     def close(self) -> None:
         """Lets go of everything; on a dead camera that takes Aravis seconds."""
