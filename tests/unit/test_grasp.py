@@ -25,7 +25,7 @@ def found(planted):
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 def test_a_face_is_grasped_on_its_surface_along_its_normal(plant, slab, tilt):
     planted = plant([slab(0.02, 0.01, 0.06, 0.04, 0.05, tilt)], noise_px=0.15)
-    heights, segments, grasps, _ = found(planted)
+    _, segments, grasps, _ = found(planted)
     best = rank.rank(grasps, segments, planted.job.tool)[0]
     normal = np.array([0, -np.sin(tilt), np.cos(tilt)])
     assert np.degrees(np.arccos(-best.T_bin_tcp[:3, 2] @ normal)) < 3
@@ -88,7 +88,7 @@ def test_the_sieve_never_stops_what_the_exact_check_passes(plant, slab):
 def test_the_order_does_not_depend_on_the_order_of_candidates(plant, slab):
     boxes = [slab(-0.08, 0, 0.06, 0.04, 0.03), slab(0.0, 0.03, 0.06, 0.04, 0.03), slab(0.08, -0.03, 0.06, 0.04, 0.03)]
     planted = plant(boxes, noise_px=0.15)
-    heights, segments, grasps, _ = found(planted)
+    _, segments, grasps, _ = found(planted)
     ranked = [g.T_bin_tcp.tobytes() for g in rank.rank(grasps, segments, planted.job.tool)]
     assert ranked == [g.T_bin_tcp.tobytes() for g in rank.rank(grasps[::-1], segments, planted.job.tool)]
 
@@ -96,8 +96,8 @@ def test_the_order_does_not_depend_on_the_order_of_candidates(plant, slab):
 def message(**changes):
     pose = PoseMessage(position_m=(0.0, 0.0, 0.05), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
     fields = {"id": "1-1", "rank": 1, "tool": ToolMessage(number=1, name="suction", kind="suction"), "frame": "bin",
-              "position_m": pose.position_m, "quaternion_xyzw": pose.quaternion_xyzw, "T_frame_pregrasp": pose, "approach_m": 0.08,
-              "lift_m": 0.15, "open_m": 0.0, "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
+              "position_m": pose.position_m, "quaternion_xyzw": pose.quaternion_xyzw, "T_frame_pregrasp": pose,
+              "approach_m": 0.08, "lift_m": 0.15, "open_m": 0.0, "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
               "sigma": Sigma(xy_m=0.001, z_m=0.001, tilt_rad=0.01)}
     return GraspMessage(**{**fields, **changes})
 

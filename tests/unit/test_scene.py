@@ -59,6 +59,13 @@ def test_a_part_above_the_rim_overfills(plant, slab):
     assert load_carrier.filling(seen(planted)[0], planted.job.bin).overfilled
 
 
+def test_mismatches_along_the_wall_neither_fill_nor_overfill(plant, slab):
+    planted = plant([slab(-0.148, 0, 0.003, 0.15, 0.13)])
+    filled = load_carrier.filling(seen(planted)[0], planted.job.bin)
+    assert not filled.overfilled
+    assert not filled.occupied
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.3, -0.5])
 def test_normals_of_a_tilted_face(plant, slab, tilt):
     planted = plant([slab(0, 0, 0.08, 0.08, 0.05, tilt)], noise_px=0.1)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from binpick import geometry
@@ -12,6 +13,8 @@ from binpick.settings import Bin
 
 FLOOR_M = 0.004
 """Nothing lower than this above the floor counts as a part: four sigma of depth at 1 m."""
+WALL_M = 0.006
+"""Width of the strip along the walls whose heights prove nothing."""
 PROOF_COVERAGE = 0.70
 """Share of the floor that must be measured before a bin is called empty."""
 
@@ -50,12 +53,20 @@ def search_box(model: Bin, above_rim_m: float) -> tuple[geometry.Vector, geometr
 
 
 def filling(heights: HeightMap, model: Bin) -> Filling:
-    """How full the bin is. A part is taken for there when its measured cells together make 1 cm² above the floor."""
-    inside = heights.height[np.isfinite(heights.height)]
+    """How full the bin is.
+
+    Something counts as there, or as above the rim, when its measured cells together make 1 cm². Cells along the walls and
+    single cells do not count: that is where a camera sees past the rim and mismatches.
+    """
+    border = int(np.ceil(WALL_M / heights.cell_m))
+    inner = heights.height[border:-border, border:-border]
     height_m = model.inner_size_m[2]
-    above = int(np.count_nonzero(inside > FLOOR_M))
+    known = np.isfinite(inner)
+
+    def rises_above(level_m: float) -> bool:
+        above = cv2.morphologyEx((known & (inner > level_m)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), dtype=np.uint8))
+        return int(above.sum()) * heights.cell_m**2 >= 1e-4
+
     return Filling(
-        level=float(np.clip(inside, 0, None).mean() / height_m) if inside.size else 0.0,
-        coverage=heights.coverage,
-        occupied=above * heights.cell_m**2 >= 1e-4,
-        overfilled=bool(np.count_nonzero(inside > height_m + FLOOR_M) * heights.cell_m**2 >= 1e-4))
+        level=float(np.clip(inner[known], 0, None).mean() / height_m) if known.any() else 0.0, coverage=heights.coverage,
+        occupied=rises_above(FLOOR_M), overfilled=rises_above(height_m + FLOOR_M))

@@ -1,0 +1,81 @@
+"""The cell file: only a bin is required; an error names file, line, key and what is allowed."""
+
+import numpy as np
+import pytest
+
+from binpick import settings
+from binpick.errors import SettingsError, UnknownItem
+
+BIN = "bin:\n  inner_size_m: [0.6, 0.4, 0.18]\n  pose: {position_m: [0, 0, 1]}\n"
+
+
+def test_only_a_bin_is_required():
+    cell = settings.parse(BIN, "cell.yaml")
+    assert cell.control == "modbus"
+    job = settings.resolve(cell)
+    assert (job.bin.number, job.tool.number, job.recipe.number) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("", "mapping"),
+    ("bin: [", "not YAML"),
+    ("bin: {}\n", "inner_size_m"),
+    (BIN + "colour: red\n", "cell.yaml:4: colour: unknown key"),
+    (BIN + "timeout_ms: 5\n", "cell.yaml:4: timeout_ms: .*100.*it is 5"),
+    (BIN + "recipes:\n  - number: 1\n    exposure_us: -4\n", "cell.yaml:6: recipes.0.exposure_us"),
+    (BIN + "recipes:\n  - {number: 1, bin: 7}\n", "no bin 7"),
+    (BIN + "recipes:\n  - {number: 1, tools: [9]}\n", "no tool"),
+    (BIN + "recipes: [{number: 2}, {number: 2}]\n", "stand once"),
+    (BIN + "bins: []\n", "not both"),
+    (BIN + "cameras: {left: {address: 1.2.3.4}}\n", "backend"),
+    (BIN + "publish: {modbus: null}\n", "control is modbus"),
+    (BIN.replace("[0, 0, 1]", "[0, 0, 1], rotvec_rad: [0, 0, 0], kuka_abc_deg: [0, 0, 0]"), "exactly one orientation"),
+    (BIN.replace("[0, 0, 1]", "[0, 0, .nan]"), "finite"),
+])
+def test_an_error_says_where_and_what(text, says):
+    with pytest.raises(SettingsError, match=says):
+        settings.parse(text, "cell.yaml")
+
+
+def test_an_error_in_a_list_is_reported_once():
+    with pytest.raises(SettingsError) as caught:
+        settings.parse(BIN + "recipes:\n  - number: 1\n    exposure_us: -4\n", "cell.yaml")
+    assert "too_short" not in str(caught.value)
+    assert "at least 1 item" not in str(caught.value)
+
+
+def test_relative_paths_start_at_the_cell_file(tmp_path):
+    file = tmp_path / "cell.yaml"
+    file.write_text(BIN + "cameras: {backend: files, left: l.png, right: /r.png}\n")
+    cell = settings.load(file)
+    assert cell.rig == tmp_path / "rig.json"
+    assert cell.cameras.left == tmp_path / "l.png"
+    assert str(cell.cameras.right) == "/r.png"
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SettingsError, match="nowhere"):
+        settings.load(tmp_path / "nowhere.yaml")
+
+
+def test_requests_choose_by_number():
+    cell = settings.parse(BIN + "recipes: [{number: 5}, {number: 6, name: second}]\n", "cell.yaml")
+    assert settings.resolve(cell).recipe.number == 5
+    assert settings.resolve(cell, recipe=6).recipe.name == "second"
+    for wrong in ({"recipe": 7}, {"bin_number": 2}, {"tool": 3}):
+        with pytest.raises(UnknownItem, match="the cell file has"):
+            settings.resolve(cell, **wrong)
+
+
+def test_settings_are_named_by_their_content():
+    a, b = (settings.resolve(settings.parse(BIN + extra, "x")) for extra in ("", "recipes: [{number: 1, exposure_us: 900}]\n"))
+    assert a.sha256 != b.sha256
+    assert a.recipe_sha256 != b.recipe_sha256
+
+
+@pytest.mark.parametrize("text", ["quaternion_xyzw: [0, 0, 0.7071068, 0.7071068]", "rotvec_rad: [0, 0, 1.5707963]",
+                                  "kuka_abc_deg: [90, 0, 0]", "fanuc_wpr_deg: [0, 0, 90]", "ur_rxryrz_rad: [0, 0, 1.5707963]"])
+def test_every_way_to_write_an_orientation(text):
+    cell = settings.parse(BIN.replace("[0, 0, 1]", f"[0, 0, 1], {text}"), "cell.yaml")
+    expected = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
+    assert np.allclose(cell.bins[0].T_parent_bin, expected, atol=1e-6)
