@@ -97,7 +97,8 @@ def message(**changes):
     pose = PoseMessage(position_m=(0.0, 0.0, 0.05), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
     fields = {"id": "1-1", "rank": 1, "tool": ToolMessage(number=1, name="suction", kind="suction"), "frame": "bin",
               "position_m": pose.position_m, "quaternion_xyzw": pose.quaternion_xyzw, "T_frame_pregrasp": pose,
-              "approach_m": 0.08, "lift_m": 0.15, "open_m": 0.0, "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
+              "approach_m": 0.08, "lift_m": 0.15, "open_m": 0.0,
+              "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
               "sigma": Sigma(xy_m=0.001, z_m=0.001, tilt_rad=0.01)}
     return GraspMessage(**{**fields, **changes})
 

@@ -7,6 +7,7 @@ import pytest
 from binpick import geometry
 from binpick.data import Light, Window
 from binpick.sim import exam
+from binpick.sim.mesh import Caster
 from binpick.sim.render import Renderer
 from binpick.sim.truth import truth
 from binpick.sim.world import ScenePart, WorldScene
@@ -33,6 +34,23 @@ def test_a_shot_is_reproducible_and_no_two_are_alike(renderer, scene):
     other = renderer.expose(scene, 0, PATTERN, 8)
     assert not np.array_equal(first, other)
     assert abs(float(first.mean()) - float(other.mean())) < 0.1
+
+
+@pytest.mark.parametrize("world", ["A", "B"])
+def test_no_part_is_seen_outside_its_silhouette(world):
+    kinds = list(exam.KINDS)
+    length, width, height = exam.setup(world).bin_size_m
+    turned = [geometry.frame_of_axes(np.array([0.3, np.sin(i), np.cos(i)]), np.array([1.0, 1.0, 0.0]),
+                                     np.array([(i % 3 - 1) * length * 0.4, (i % 2 - 0.5) * width * 0.8, height - 0.03 * i]))
+              for i in range(len(kinds))]
+    scene = WorldScene(world, tuple(ScenePart(i, k, T) for i, (k, T) in enumerate(zip(kinds, turned, strict=True), 1)), 1, 1)
+    renderer = Renderer(exam.rig(world), world)
+    for index in (0, 1):
+        renderer.radiance(scene, index, False)
+        view = renderer._views[index]
+        shown = np.flatnonzero(Caster(scene).cast(view.rays).part_id > 0)
+        assert len(shown) > 10_000
+        assert np.isin(shown, renderer._silhouettes(scene, index, view.crop)).all()
 
 
 def test_a_shot_draws_nothing_anew(renderer, scene):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int16
 
-from binpick.data import Depth, Mask, Rectified, frozen
+from binpick.data import Depth, Image, Mask, Rectified, frozen
 from binpick.settings import StereoSettings
 from binpick.stereo.match import SCALE, Matched
 
@@ -14,6 +14,9 @@ AGREEMENT = 12
 """Left and right agree within this, 1/16 px at half resolution: 1.5 px, OpenCV's default, at full resolution."""
 EDGE_RADIUS = 1
 """Half-resolution pixels around a depth edge that lose confidence: OpenCV's 3 would be 6 at full resolution."""
+TEXTURE_PX = 7
+LEAST_CONTRAST = 4
+"""Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
 JUMP_PX = 2.0
 """A disparity step between neighbours above this is a depth edge."""
 
@@ -21,9 +24,9 @@ JUMP_PX = 2.0
 def measure(matched: Matched, rectified: Rectified, settings: StereoSettings) -> Depth:
     """The depth of the window's pixels.
 
-    A pixel is measured when SGBM matched it, the WLS filter's left-right confidence reaches `min_confidence`, it is not
-    within `edge_px` of a depth edge and not in a speckle. OpenCV's filter wants the right disparity negated, which
-    its right matcher already delivers (opencv_contrib#2974).
+    A pixel is measured when its surroundings have texture, SGBM matched it, the WLS filter's left-right confidence reaches
+    `min_confidence`, and it is neither within `edge_px` of a depth edge nor in a speckle. OpenCV's filter wants the right
+    disparity negated, which its right matcher already delivers (opencv_contrib#2974).
     """
     wls = cv2.ximgproc.createDisparityWLSFilter(matched.half_matcher)
     wls.setLambda(settings.wls_lambda)
@@ -37,7 +40,7 @@ def measure(matched: Matched, rectified: Rectified, settings: StereoSettings) ->
     filled = cv2.resize(smooth.astype(np.float32) * np.float32(2 / SCALE), (cols, rows),
                         interpolation=cv2.INTER_LINEAR)[:, margin:]
     raw = np.ascontiguousarray(matched.left[:, margin:])
-    measured = gate(raw, settings) & (confidence >= settings.min_confidence)
+    measured = gate(raw, settings) & (confidence >= settings.min_confidence) & _textured(rectified.left[:, margin:])
     disparity = raw.astype(np.float32) / SCALE + rectified.window.min_disparity
     disparity[~measured] = np.nan
     return Depth(disparity=frozen(disparity), filled=frozen(filled + np.float32(rectified.window.min_disparity)),
@@ -54,6 +57,12 @@ def gate(raw: Int16[np.ndarray, "h w"], settings: StereoSettings) -> Mask:
     if settings.edge_px:
         sound &= ~_near_jump(raw, sound, settings.edge_px)
     return sound
+
+
+def _textured(image: Image) -> Mask:
+    """Where the image varies at all within a block: black and saturated areas match everything equally well."""
+    contrast = cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8))
+    return np.asarray(contrast >= LEAST_CONTRAST)
 
 
 def _near_jump(raw: Int16[np.ndarray, "h w"], sound: Mask, edge_px: int) -> Mask:
