@@ -5,18 +5,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from binpick import geometry
 from binpick.data import Image, Light
 from binpick.rig import Rig
 from binpick.sim import exam
-from binpick.sim.mesh import TABLE_ID, Caster, Hits, Rays
+from binpick.sim.mesh import TABLE_ID, Caster, Hits, Rays, part_mesh
 from binpick.sim.projector import Projector
 from binpick.sim.surface import Shading, materials, radiance, shade
 from binpick.sim.world import WorldScene
 
 Radiance = Float32[np.ndarray, "h w"]
+Pixels = Int[np.ndarray, "n"]
 # pictures kept: two cameras, pattern on and off, this world and the last
 KEPT = 8
 # parts that stand out of the bin are drawn up to this height above the rim, metres
@@ -84,7 +85,7 @@ class Renderer:
         view, caster = self._views[index], self._cast(scene)
         rows, columns = view.crop
         shape = (rows.stop - rows.start, columns.stop - columns.start)
-        shading = self._with_parts(view, scene, caster)
+        shading = self._with_parts(view, scene, caster, self._silhouettes(scene, index, view.crop))
         full = view.empty[pattern].copy()
         full[view.crop] = radiance(shading, shape, scene, caster, pattern, self._optics)
         picture: Radiance = cv2.GaussianBlur(full, (0, 0), self._optics.blur_sigma_px)
@@ -97,16 +98,29 @@ class Renderer:
             self._caster = (scene.digest, Caster(scene))
         return self._caster[1]
 
-    def _with_parts(self, view: View, scene: WorldScene, caster: Caster) -> Shading:
-        """The background's shading, shaded anew only where parts are."""
-        hits = caster.cast(view.rays)
-        seen = np.flatnonzero(hits.part_id > 0)
-        parts = self._shaded(view.rays[seen], hits.take(seen), scene)
+    def _with_parts(self, view: View, scene: WorldScene, caster: Caster, maybe: Pixels) -> Shading:
+        """The background's shading, shaded anew only where parts are, which is among the pixels `maybe`."""
+        hits = caster.cast(view.rays[maybe])
+        of_parts = np.flatnonzero(hits.part_id > 0)
+        seen = maybe[of_parts]
+        parts = self._shaded(view.rays[seen], hits.take(of_parts), scene)
         b = view.background
         shading = Shading(b.albedo.copy(), b.ambient.copy(), b.projected.copy(), b.to_light.copy())
         shading.albedo[seen], shading.ambient[seen] = parts.albedo, parts.ambient
         shading.projected[seen], shading.to_light[seen] = parts.projected, parts.to_light
         return shading
+
+    def _silhouettes(self, scene: WorldScene, index: int, crop: tuple[slice, slice]) -> Pixels:
+        """Pixels of the crop, counted row by row, that can show a part: the hulls of their corners, generously."""
+        camera = self._rig.cameras[index]
+        T_cam_bin = camera.T_camera_rig @ exam.setup(self._world).T_camera_bin
+        mask = np.zeros((crop[0].stop - crop[0].start, crop[1].stop - crop[1].start), np.uint8)
+        for part in scene.parts:
+            corners = geometry.transform(T_cam_bin @ part.T_bin_part, part_mesh(part.kind).vertices)
+            outline = _projected(corners, camera.K_px, camera.distortion_coefficients) - [crop[1].start, crop[0].start]
+            cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(outline).astype(np.int32)), 1)
+        # hulls are rounded to whole pixels, and a distorted edge bulges by 0.2 px
+        return np.flatnonzero(cv2.dilate(mask, np.ones((7, 7), np.uint8)))
 
     def _shaded(self, rays: Rays, hits: Hits, scene: WorldScene) -> Shading:
         # what misses even the table is drawn as far table
@@ -160,10 +174,17 @@ def _outline(setup: exam.Setup) -> Float[np.ndarray, "8 3"]:
     return geometry.box_corners(np.array([-x, -y, 0.0]), np.array([x, y, height + ABOVE_RIM_M]))
 
 
+def _projected(points_cam: Float[np.ndarray, "n 3"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "k"],
+               ) -> Float[np.ndarray, "n 2"]:
+    """Where a camera sees points, px (x, y)."""
+    pixels: Float[np.ndarray, "n 2"] = cv2.projectPoints(points_cam, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2)
+    return pixels
+
+
 def _crop(points_cam: Float[np.ndarray, "n 3"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "k"],
           size: tuple[int, int]) -> tuple[slice, slice]:
     """Rows and columns around the picture of some points."""
-    seen = cv2.projectPoints(points_cam, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2)
+    seen = _projected(points_cam, K, distortion)
     low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(seen.max(axis=0)).astype(int) + 3, size)
     return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))

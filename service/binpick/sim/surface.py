@@ -59,8 +59,7 @@ def radiance(shading: Shading, shape: tuple[int, int], scene: WorldScene, caster
     """The picture (not yet blurred) of the points of a grid, with what stands in the light and the light they hand on."""
     direct = shading.ambient * _openness(shading.to_light, scene, caster, optics)
     if pattern:
-        lit = np.flatnonzero(shading.projected > 0)
-        direct[lit] += shading.projected[lit] * ~caster.blocked(shading.to_light[lit], 0.0, 1.0)
+        direct += shading.projected * ~caster.blocked(shading.to_light, 0.0, 1.0)
     picture: Grid = direct.reshape(shape)
     return picture + shading.albedo.reshape(shape) * (np.float32(optics.interreflection) * _bounced(picture))
 
