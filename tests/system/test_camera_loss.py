@@ -347,6 +347,11 @@ def test_one_killed_is_named_alone_and_its_stuck_thread_delays_nobody(tmp_path: 
         assert max(reads) < 500, f"{len(reads)} reads; p50, p99, max {np.percentile(reads, [50, 99, 100])} ms"
         gige.restart(1)
         cell.wait(cell.ready, "ready again")
+        gige.restart(0)                       # without power for a moment: it has forgotten who controls it
+        lost = cell.cycle().json()
+        assert (lost["code"], lost["detail"].startswith("camera left obeys this daemon no longer")) == (CAMERAS, True), lost
+        cell.wait(cell.ready, "ready again")
+        assert cell.cycle().status_code == 200, cell.log.read_text()       # though the right one was still exposing
         kill(gige, 0, 1)
         assert cell.cycle().json()["code"] == CAMERAS
         ends_well(cell)                       # with both threads in the driver

@@ -144,6 +144,38 @@ def test_both_dead_cameras_stand_in_one_error() -> None:
     group.close()
 
 
+def test_a_camera_that_still_exposes_for_a_broken_shot_is_waited_for() -> None:
+    class Exposing(Odd):
+        """Misses what real cameras miss: a trigger while it exposes."""
+
+        def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+            assert not self.exposing
+            super().trigger(sequence, deadline_ns)
+            self.exposing = True
+
+        def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+            frame = super().grab(sequence, deadline_ns)
+            self.exposing = False
+            return frame
+
+        exposing = False
+
+    class Once(Odd):
+        """Fails at its first trigger."""
+
+        def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+            if self.opened == 1:
+                raise CameraLost("left is gone", "left")
+            super().trigger(sequence, deadline_ns)
+
+    group = grouped(Once(0), Exposing(1))
+    with pytest.raises(CameraLost, match="left"):
+        group.capture(LIGHT, within(2))
+    group.open(within(1))
+    pair = group.capture(LIGHT, within(2))
+    assert (pair.left.sequence, pair.right.sequence) == (2, 2)
+
+
 def test_a_group_that_was_never_opened_says_so() -> None:
     group = CameraGroup((SimCamera(0, lambda *_: image_of()), SimCamera(1, lambda *_: image_of())), 500.0)
     with pytest.raises(CameraError, match="camera left is not open; camera right is not open"):

@@ -35,6 +35,7 @@ class CameraGroup:
         self._wall_clock = wall_clock
         self._open = [False, False]
         self._errors = ["", ""]
+        self._due: list[MonotonicNs | None] = [None, None]
         self._light: tuple[float, float, bool] | None = None
         self._sequence = 0
 
@@ -49,6 +50,8 @@ class CameraGroup:
         in all. A dead camera is noticed within the exposure and 1.4 s, whatever the deadline is, and stays closed until `open`.
         """
         self._each(lambda i, camera: self._require_open(i, camera))
+        # one whose shot the other's failure broke off may still expose, and would miss its next trigger
+        self._each(lambda i, camera: self._due[i] and self._fetch(i, camera, deadline_ns))
         self._configure(light, deadline_ns)
         for _ in range(TRIES):
             pair = self._shoot(light, deadline_ns)
@@ -62,14 +65,13 @@ class CameraGroup:
         captured_at = self._wall_clock().isoformat(timespec="milliseconds")
         ticks = [self._clock()]
 
-        def trigger(_index: int, camera: Camera) -> None:
+        def trigger(index: int, camera: Camera) -> None:
             camera.trigger(self._sequence, min(deadline_ns, self._clock() + COMMAND_NS))
             ticks.append(self._clock())
+            self._due[index] = ticks[-1] + int(light.exposure_us * 1000) + IMAGE_NS
 
         self._each(trigger)
-        limit = ticks[-1] + int(light.exposure_us * 1000) + IMAGE_NS
-        left, right = self._each(lambda _, camera: camera.grab(
-            self._sequence, min(deadline_ns, max(limit, self._clock() + SECOND_NS))))
+        left, right = self._each(lambda i, camera: self._fetch(i, camera, deadline_ns))
         for frame in (left, right):
             self._check(frame, ticks[0])
             frozen(frame.image)
@@ -77,6 +79,11 @@ class CameraGroup:
             raise PairRefused(f"the images differ in size: left {_size(left)}, right {_size(right)} pixels")
         skew_us, sigma_us, proof = self._skew(left, right, ticks)
         return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew_us, sigma_us=sigma_us, proof=proof)
+
+    def _fetch(self, index: int, camera: Camera, deadline_ns: MonotonicNs) -> Frame:
+        """The image of its last trigger."""
+        limit, self._due[index] = max(self._due[index] or 0, self._clock() + SECOND_NS), None
+        return camera.grab(self._sequence, min(deadline_ns, limit))
 
     def close(self) -> None:
         """Closes both, at most 1 s each; never raises."""
@@ -91,7 +98,7 @@ class CameraGroup:
 
     def _open_one(self, index: int, camera: Camera, deadline_ns: MonotonicNs) -> None:
         camera.open(deadline_ns)
-        self._open[index], self._errors[index], self._light = True, "", None
+        self._open[index], self._errors[index], self._light, self._due[index] = True, "", None, None
 
     def _require_open(self, index: int, camera: Camera) -> None:
         if not self._open[index]:

@@ -106,6 +106,7 @@ class Worker:
             self.board.step(machine.finish, ticket.cycle_id, None)
             return
         except BinpickError as error:
+            log.warning("cycle %d: %s", ticket.cycle_id, error)
             result = self._failure(ticket, error.code, str(error))
         except Exception:
             log.exception("cycle %d: unexpected", ticket.cycle_id)

@@ -206,7 +206,8 @@ class Driver:
         aravis, _ = _library()
         kind = aravis.DeviceError
         if error.code in (kind.PROTOCOL_ERROR_ACCESS_DENIED, kind.NOT_CONTROLLER):
-            return CameraHeld(f"camera {self._name}: another program took control of it", self._name)
+            return CameraHeld(f"camera {self._name} obeys this daemon no longer: it was without power for a moment, or another "
+                              "program took control of it", self._name)
         if error.code in (kind.FEATURE_NOT_FOUND, kind.WRONG_FEATURE, kind.INVALID_PARAMETER,
                           kind.PROTOCOL_ERROR_INVALID_PARAMETER):
             return CameraError(f"camera {self._name} does not accept {doing}: {error.message}", self._name)
