@@ -34,7 +34,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports --no-cache
 
 check: lint  ## lint, types, contracts, unit and contract tests, one in-process cycle (90 s)
-	$(BIN)/pytest -q -m "not slow and not browser"
+	$(BIN)/pytest -q tests/unit tests/contract -m "not slow"
 
 test: install-test lint  ## everything that CI runs
 	$(BIN)/pytest
