@@ -4,7 +4,6 @@ A `Result` is made once per cycle and serialised once to bytes; REST sends those
 object. Lengths are metres, angles radians, times milliseconds where the name says so.
 """
 
-import functools
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -171,7 +170,6 @@ class Result(Wire):
     captured_at: str | None
     age_ms: float | None = None
     simulated: bool = False
-    preview: bool = False
     return_code: ReturnCode
     bin: BinMessage | None
     grasps: tuple[GraspMessage, ...] = ()
@@ -189,12 +187,6 @@ class Result(Wire):
     def timeless_bytes(self) -> bytes:
         """Without times and ages: equal bytes mean an equal answer."""
         return self.model_copy(update={"timing_ms": {}, "age_ms": None, "captured_at": None}).json_bytes()
-
-
-@functools.cache
-def failure_bin(number: int) -> BinMessage:
-    """The bin entry of a cycle that never got to look for it."""
-    return BinMessage(found=False, number=number, T_camera_bin=None, fill_level=None, coverage=None)
 
 
 def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, simulated: bool = False) -> Result:
@@ -243,12 +235,14 @@ class CycleResult:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A finished cycle as it is published: the object, its bytes, and when (monotonic ns) its images were triggered."""
+    """A finished cycle as it is published: the object, its bytes, and when (monotonic ns) its images were triggered.
+
+    Without images it is when the cycle ended.
+    """
 
     result: Result
     body: bytes
     triggered_ns: int
-    finished_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +265,6 @@ class Snapshot:
     boot_id: int
     phase: Literal["starting", "ready", "acquiring", "computing", "stopping"] = "starting"
     current: int = 0
-    request: Request | None = None
     acquired: bool = False
     published: Published | None = None
     valid: bool = False

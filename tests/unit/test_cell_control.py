@@ -144,7 +144,6 @@ def test_a_cycle_is_captured_computed_and_published() -> None:
             assert list(result.timing_ms) == ["acquire", "match", "total"]
             assert result.simulated
             assert shown.published.body == result.json_bytes()
-            assert cell.result(1) is result
             assert cell.finished(1) is shown.published
             assert cameras.captures[0].exposure_us == 6000.0
             cell.acknowledge(1, "rest")
@@ -247,9 +246,9 @@ def test_abort_ends_the_cycle_between_two_stages() -> None:
             assert cell.snapshot().phase == "computing"
             assert cell.snapshot().acquired
             cell.abort(cycle_id, "rest")
-            kept = cell.result(cycle_id)
+            kept = cell.finished(cycle_id)
             assert kept is not None
-            assert kept.return_code.code is Code.ABORTED
+            assert kept.result.return_code.code is Code.ABORTED
             with pytest.raises(NotApplicable):
                 cell.abort(cycle_id, "rest")
             gate.set()

@@ -42,7 +42,7 @@ def grasp(cycle_id: int, number: int = 1) -> GraspMessage:
 def answer(cycle_id: int, at_ns: int, code: Code = Code.OK) -> Published:
     result = Result(cycle_id=cycle_id, request=Request(), captured_at=None, return_code=ReturnCode.of(code), bin=None,
                     grasps=(grasp(cycle_id),) if code.carries_poses else ())
-    return Published(result, result.json_bytes(), triggered_ns=at_ns, finished_ns=at_ns)
+    return Published(result, result.json_bytes(), triggered_ns=at_ns)
 
 
 def started(state: State = READY, now_ns: int = 0, timeout_ns: int = S) -> State:

@@ -65,7 +65,7 @@ def published(code: Code, grasps: int = 0, tool: str = "suction") -> Published:
         funnel=Funnel(counts={"faces": 4, "no_seal": 9, "gate_novel": 1, "collide": 0}, dominating="no_seal"),
         sync=SyncMessage(skew_us=12.4, sigma_us=1, proof="ptp", resends=0, missing=0),
         timing_ms={"acquire": 20.0, "match": 100.0, "compute": 100.0, "total": 120.0})
-    return Published(result, b"", 1, 2)
+    return Published(result, b"", 1)
 
 
 def snapshot(latest: Published | None = None) -> Snapshot:
@@ -76,7 +76,7 @@ def snapshot(latest: Published | None = None) -> Snapshot:
 @pytest.mark.parametrize("code", list(Code))
 def test_every_panel_shows_every_code(code: Code) -> None:
     for latest in (published(code, grasps=8 if code.carries_poses else 0),
-                   Published(failure(12, Request(), code), b"", 1, 2)):
+                   Published(failure(12, Request(), code), b"", 1)):
         shown = " ".join(Text(panel(snapshot(latest))).all for panel in PANELS)
         assert code.message in shown
         assert "cycle 12" in shown

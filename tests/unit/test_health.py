@@ -20,7 +20,7 @@ RESULT = failure(1, Request(), Code.CALIBRATION_WARNING)
     (Snapshot(1, "starting", cameras=UP), ("degraded", False, ("a withdrawn cycle is still being cleared away",))),
     (Snapshot(1, "stopping", cameras=UP), ("degraded", False, ("the cell is stopping",))),
     (Snapshot(1, "ready", cameras=UP, faults=("internal error",)), ("degraded", True, ("internal error",))),
-    (Snapshot(1, "ready", cameras=UP, latest=Published(RESULT, b"", 0, 0)),
+    (Snapshot(1, "ready", cameras=UP, latest=Published(RESULT, b"", 0)),
      ("degraded", True, (Code.CALIBRATION_WARNING.message,))),
 ])
 def test_the_facts_give_the_judgement(snapshot: Snapshot, expected: tuple[str, bool, tuple[str, ...]]) -> None:

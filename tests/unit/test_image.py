@@ -52,7 +52,7 @@ def snapshot(count: int = 2, *, code: Code = Code.OK, cycle_id: int = 7, **chang
         "sync": SyncMessage(skew_us=-70000.4, sigma_us=3, proof="ptp", resends=2, missing=1),
         "timing_ms": {"acquire": 61.6, "total": 271.2}}
     result = Result.model_validate({**fields, **changes})
-    published = Published(result, result.json_bytes(), 0, 0)
+    published = Published(result, result.json_bytes(), 0)
     return Snapshot(boot_id=0x1F00F, phase="ready", published=published, valid=True, latest=published, owner="modbus",
                     cameras=(CameraStatus("left", True), CameraStatus("right", False, error="dead")),
                     counts=(("started", 70000), ("unheard_of", 3)))

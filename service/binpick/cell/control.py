@@ -14,7 +14,7 @@ from binpick.cell.gallery import Gallery
 from binpick.cell.worker import Cameras, Run, Worker
 from binpick.errors import CycleRefused, NotInControl
 from binpick.recording import Recorder
-from binpick.result import Artefact, Published, Request, Result, Snapshot
+from binpick.result import Artefact, Published, Request, Snapshot
 from binpick.rig import Rig
 
 STOP_LIMIT_S = 2.0
@@ -50,13 +50,8 @@ class Cell:
         """Ends a subscription."""
         self._board.unsubscribe(event)
 
-    def result(self, cycle_id: int) -> Result | None:
-        """A finished cycle still in memory, or None."""
-        kept = self.finished(cycle_id)
-        return kept.result if kept else None
-
     def finished(self, cycle_id: int) -> Published | None:
-        """The same with its bytes and the instant of its trigger."""
+        """A finished cycle still in memory, or None."""
         return machine.find(self._board.state, cycle_id)
 
     def artefact(self, cycle_id: int, name: str) -> Artefact | None:

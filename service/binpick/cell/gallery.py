@@ -5,8 +5,6 @@ import threading
 from binpick import artefacts
 from binpick.result import Artefact, CycleInput, CycleResult
 
-NAMES = frozenset({"cloud.ply", "overlay.png", "disparity.png", "confidence.png", "left.png", "right.png"})
-
 
 class Exhibit:
     """One cycle's arrays, and what was drawn of them."""
@@ -42,4 +40,6 @@ class Gallery:
     def artefact(self, cycle_id: int, name: str) -> Artefact | None:
         """The artefact of that cycle; None when another cycle is shown, or there is no such picture."""
         shown = self._shown
-        return shown.artefact(name) if shown is not None and shown.cycle_id == cycle_id and name in NAMES else None
+        if shown is None or shown.cycle_id != cycle_id or name not in artefacts.DRAW:
+            return None
+        return shown.artefact(name)

@@ -215,7 +215,7 @@ def snapshot(state: State, boot_id: int, owner: Owner) -> Snapshot:
     running = state.running
     return Snapshot(
         boot_id=boot_id, phase=state.phase, current=running.cycle_id if running else 0,
-        request=running.request if running else None, acquired=running.acquired if running else False,
+        acquired=running.acquired if running else False,
         published=state.published, valid=state.valid, withdrawn=state.withdrawn,
         latest=state.finished[-1] if state.finished else None, cameras=state.cameras, faults=state.faults, owner=owner,
         simulated=state.simulated, counts=tuple(sorted(state.counts.items())))
@@ -227,7 +227,7 @@ def _retire(state: State, code: Code, now_ns: int, why: str = "") -> State:
     assert ticket is not None
     result = failure(ticket.cycle_id, ticket.request, code, why, simulated=state.simulated)
     state = replace(state, ticket=replace(ticket, retired=True))
-    return _publish(state, Published(result, result.json_bytes(), triggered_ns=now_ns, finished_ns=now_ns))
+    return _publish(state, Published(result, result.json_bytes(), triggered_ns=now_ns))
 
 
 def _publish(state: State, published: Published) -> State:

@@ -114,7 +114,7 @@ class Worker:
             result = self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR)
         finished_ns = self.clock()
         triggered_ns = _triggered_ns(inputs.pair) if inputs else finished_ns
-        published = Published(result, result.json_bytes(), triggered_ns, finished_ns)
+        published = Published(result, result.json_bytes(), triggered_ns)
         # cameras first: who sees the result and triggers again must not be told READY by cameras that just died
         self.board.step(machine.observe, self.cameras.statuses())
         state = self.board.step(machine.finish, ticket.cycle_id, published, fault)

@@ -3,7 +3,7 @@
 import asyncio
 from typing import Literal, Protocol, runtime_checkable
 
-from binpick.result import Artefact, Published, Request, Result, Snapshot
+from binpick.result import Artefact, Published, Request, Snapshot
 
 __all__ = ["Artefact", "Control", "Source", "View"]
 
@@ -26,12 +26,8 @@ class View(Protocol):
         """Ends a subscription."""
         ...
 
-    def result(self, cycle_id: int) -> Result | None:
-        """A finished cycle still in memory (the last 16), or None."""
-        ...
-
     def finished(self, cycle_id: int) -> Published | None:
-        """The same with its bytes and the instant of its trigger, from which its age is told."""
+        """A finished cycle still in memory (the last 16) with its bytes and the instant its age is told from, or None."""
         ...
 
     def artefact(self, cycle_id: int, name: str) -> Artefact | None:

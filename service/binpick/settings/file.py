@@ -1,6 +1,5 @@
 """Reads a cell file; an error names file, line, key and what is allowed."""
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -81,8 +80,3 @@ def _line(node: yaml.Node | None, loc: list[Any]) -> int:
 def schema() -> str:
     """The cell file's JSON schema, as `binpick schema` prints it."""
     return json.dumps(Cell.model_json_schema(), indent=1) + "\n"
-
-
-def digest(cell: Cell) -> str:
-    """Names a whole cell file in a result."""
-    return hashlib.sha256(cell.model_dump_json().encode()).hexdigest()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int16, UInt8, UInt16
+from jaxtyping import Float, Int16, UInt16
 
 from binpick import geometry
 from binpick.data import Image, Rectified, Window, frozen
@@ -137,8 +137,3 @@ class _Key:
 
 def _maps(sha256: str, rig: Rig, view: Window) -> tuple[Map, Map]:
     return _maps_of(_Key(sha256, rig, view))
-
-
-def crop(image: UInt8[np.ndarray, "h w"], rectified: Rectified) -> UInt8[np.ndarray, "h2 w2"]:
-    """The window's own pixels of a rectified image, without the search margin."""
-    return image[:, rectified.margin:]
