@@ -7,7 +7,9 @@ truth what was picked.
 
 import asyncio
 import contextlib
+import logging
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -19,23 +21,36 @@ from pathlib import Path
 import numpy as np
 import yaml
 from rich.console import Console
+from rich.status import Status
 
 from binpick import geometry, settings
 from binpick import rig as rig_file
-from binpick.data import Image, Light
-from binpick.errors import Code, NotReady
+from binpick.errors import Code, NotReady, PortInUse
 from binpick.geometry import Transform
+from binpick.poses import PoseFormat, encode
 from binpick.sim import exam, score
-from binpick.sim.gige import GigePair
+from binpick.sim.gige import GigePair, gvcp
 from binpick.sim.plc import Plc, PlcResult
-from binpick.sim.render import Renderer
-from binpick.sim.world import World
+from binpick.sim.score import Verdict
+from binpick.sim.twin import Twin
 
 BASE_FRAME = 3
 """Number of the robot's base in the registers."""
 READY_S = 60.0
 """For the daemon's first READY; importing its libraries takes seconds on a cold disk."""
 OUTCOME_OK, OUTCOME_MISSED, OUTCOME_COLLISION = 1, 2, 4
+BARREN = 3
+"""Cycles in a row without a pick, after which the picking ends."""
+KINDS = "block+cylinder+tee"
+"""What lies in the demo's bin: parts that its one cup can take however they come to lie. A bolt offers no cup a place."""
+TOOL = {
+    "number": 1, "name": "bellows cup 12 mm on a lance",
+    # a cup of 1.5 folds follows a round bar: 0.75 mm either way on Ø24
+    "cups": [{"radius_m": 0.006}], "compliance_m": 0.002,
+    "bodies": [
+        {"shape": "cylinder", "radius_m": 0.006, "length_m": 0.016, "T_tcp_body": {"position_m": [0.0, 0.0, -0.010]}},
+        {"shape": "cylinder", "radius_m": 0.005, "length_m": 0.190, "T_tcp_body": {"position_m": [0.0, 0.0, -0.105]}},
+        {"shape": "cylinder", "radius_m": 0.040, "length_m": 0.050, "T_tcp_body": {"position_m": [0.0, 0.0, -0.225]}}]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +60,7 @@ class Plan:
     cycles: int = 0
     world: str = "A"
     parts: int = 25
-    seed: int = 7
+    seed: int = 4
     cameras: tuple[str, str] = ("127.0.0.2", "127.0.0.3")
     rest_port: int = 8080
     modbus_port: int = 5020
@@ -54,108 +69,107 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """What the world says of one cycle; `part` is the kind that was picked, "" when none was."""
+    """One cycle: what the daemon answered, where the tool went (None: nowhere), and what the world says became of it."""
 
     code: Code
-    part: str
-    reason: str
-    T_base_tcp: Transform | None
-    distance_m: float
-    angle_rad: float
-    collision: bool
     recipe: int
     acquire_ms: int
     total_ms: int
+    T_base_tcp: Transform | None = None
+    verdict: Verdict | None = None
 
-    def sentence(self, number: int) -> str:
-        """The printed line: outcome, pose, true error (signed distance to the surface along the approach, angle), times."""
-        if self.T_base_tcp is None:
-            return f"{number:3d}  {self.code.value} {self.code.name.lower()}: {self.code.message}"
+    @property
+    def picked(self) -> bool:
+        """Whether a part left the bin."""
+        return self.verdict is not None and self.verdict.ok
+
+    @property
+    def collided(self) -> bool:
+        """Whether the tool ran into something."""
+        return self.verdict is not None and self.verdict.penetration_m > score.MAX_PENETRATION_M
+
+    def row(self, number: int) -> str:
+        """The printed line under HEADING; why nothing was picked follows on a line of its own."""
+        if self.T_base_tcp is None or self.verdict is None:
+            return f"{number:5d}  {self.code.value} {self.code.name.lower()}: {self.code.message}"
         x, y, z = 1000 * self.T_base_tcp[:3, 3]
-        outcome = f"picked {self.part:<9}" if self.part else f"MISSED ({self.reason})"
-        spoken = "rotation vector" if self.recipe == 1 else "quaternion"
-        pose = f"at {x:7.1f} {y:7.1f} {z:7.1f} mm ({spoken:<15})"
-        error = f"true error {1000 * self.distance_m:+5.2f} mm {np.degrees(self.angle_rad):4.1f}°"
-        return f"{number:3d}  {outcome} {pose}  {error}  images {self.acquire_ms:4d} ms  poses {self.total_ms:4d} ms"
+        outcome = f"picked {self.verdict.kind}" if self.picked else "MISSED"
+        spoken = PoseFormat.ur_rxryrz_rad if self.recipe == 1 else PoseFormat.quaternion_xyzw
+        numbers = encode(geometry.quaternion(self.T_base_tcp), spoken)
+        orientation = ("UR" if self.recipe == 1 else "quat").ljust(5) + "".join(f"{n:8.4f}" for n in numbers)
+        error = f"{1000 * self.verdict.distance_m:+8.2f}{np.degrees(self.verdict.angle_rad):7.1f}°"
+        line = f"{number:5d}  {outcome:<16}{x:8.1f}{y:8.1f}{z:8.1f}  {orientation:<37}{error}"
+        line += f"{self.acquire_ms:6d} ms{self.total_ms:5d} ms"
+        return line if self.picked else f"{line}\n       {self.verdict.reason}"
 
 
-class Twin:
-    """The world as the cameras see it: renders when it changes, so a shot only adds exposure and noise."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.world = World(plan.world, "mixed", plan.parts, plan.seed)
-        self.T_base_bin = exam.setup(plan.world).T_base_bin
-        self._renderer = Renderer(exam.rig(plan.world), plan.world)
-        self._scene = self.world.scene()
-        self.render()
-
-    def render(self) -> None:
-        """Shows the cameras the world as it is now, with the pattern on as the recipes ask."""
-        scene = self.world.scene()
-        for index in (0, 1):
-            self._renderer.radiance(scene, index, True)
-        self._scene = scene
-
-    def image(self, index: int, light: Light, shot: int) -> Image:
-        """What a camera's sensor reads out."""
-        return self._renderer.expose(self._scene, index, light, shot)
-
-    def move(self, result: PlcResult, recipe: int, tool: settings.Tool) -> Pick:
-        """Sends the tool to the first pose of a result; a part that is picked leaves the bin."""
-        code = Code(result.return_code)
-        if not result.records:
-            return Pick(code, "", "", None, np.nan, np.nan, False, recipe, result.acquire_ms, result.total_ms)
-        if result.frame != BASE_FRAME:
-            raise NotReady(f"the registers give poses in frame {result.frame}, the robot needs its base ({BASE_FRAME})")
-        T_base_tcp = result.records[0].T_frame_tcp
-        verdict = score.judge(self.world.scene(), geometry.inverse(self.T_base_bin) @ T_base_tcp, tool)
-        if verdict.ok:
-            self.world.remove(verdict.part_id)
-            self.world.settle()
-            self.render()
-        return Pick(
-            code,
-            verdict.kind if verdict.ok else "",
-            verdict.reason,
-            T_base_tcp,
-            verdict.distance_m,
-            verdict.angle_rad,
-            verdict.penetration_m > score.MAX_PENETRATION_M,
-            recipe,
-            result.acquire_ms,
-            result.total_ms,
-        )
+HEADING = (f"cycle  {'outcome':<16}{'x':>8}{'y':>8}{'z mm':>8}  {'orientation, as the recipe speaks':<37}"
+           f"{'error mm':>8}{'angle':>8}{'images':>9}{'poses':>8}")
 
 
-def run(plan: Plan, headless: bool, say: Console | None = None) -> int:
-    """Plays the cell; returns 0 unless a tool collided, nothing could be picked, or something broke.
+def run(plan: Plan, headless: bool) -> int:
+    """Plays the cell; returns 0 when all went well, or Ctrl-C or SIGTERM ended it.
 
-    Raises PortInUse, NotReady and the like when it cannot start.
+    Returns 1 when the tool ran into something, nothing could be picked, the picking ended before the plan's last cycle with
+    parts in the bin, or the bin was called empty and was not. Raises PortInUse, NotReady and the like when it cannot go on.
     """
-    say = say or Console(highlight=False)
+    say = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
+    _require_free(plan)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # an answer that comes after Ctrl-C is no news
+    logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)
     try:
-        return asyncio.run(_play(plan, headless, say))
-    except KeyboardInterrupt:
+        with _waiting(say, f"Letting {plan.parts} parts fall into the bin, and drawing it ..."):
+            twin = Twin(plan.world, KINDS, plan.parts, plan.seed)
+        return asyncio.run(_play(plan, twin, headless, say))
+    except (KeyboardInterrupt, asyncio.CancelledError):
         say.print("stopped")
         return 0
 
 
-async def _play(plan: Plan, headless: bool, say: Console) -> int:
-    with say.status(f"Letting {plan.parts} parts fall into the bin, and lighting the scene ..."):
-        twin = await asyncio.to_thread(Twin, plan)
+def _require_free(plan: Plan) -> None:
+    """Raises PortInUse, before anything slow begins."""
+    wanted = [("127.0.0.1", port, socket.SOCK_STREAM) for port in (plan.rest_port, plan.modbus_port)]
+    wanted += [(address, gvcp.PORT, socket.SOCK_DGRAM) for address in plan.cameras]
+    for host, port, kind in wanted:
+        with socket.socket(socket.AF_INET, kind) as probe:
+            if kind is socket.SOCK_STREAM:
+                # as servers do: connections of a demo that ended a moment ago do not matter
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError as error:
+                raise PortInUse(f"the demo cannot use {host}:{port} ({error.strerror}): end the program that has it, "
+                                "perhaps another demo, and start again") from error
+
+
+@contextlib.contextmanager
+def _waiting(say: Console, what: str) -> Iterator[Status]:
+    """Says what takes time: beside a spinner on a terminal, as a line elsewhere."""
+    if not say.is_terminal:
+        say.print(what)
+    with say.status(what) as status:
+        yield status
+
+
+async def _play(plan: Plan, twin: Twin, headless: bool, say: Console) -> int:
+    _cancel_on_signals(say)
     with tempfile.TemporaryDirectory(prefix="binpick-demo-") as folder, GigePair(twin.image, plan.cameras):
         cell = files(plan, Path(folder))
+        say.print(f"cameras     {plan.cameras[0]} and {plan.cameras[1]} (GigE Vision, simulated)")
         with _daemon(Path(folder)) as alive:
-            say.print(f"cameras   {plan.cameras[0]} and {plan.cameras[1]} (GigE Vision, simulated)")
-            say.print(
-                f"page      http://127.0.0.1:{plan.rest_port}/ui    REST  http://127.0.0.1:{plan.rest_port}/v1    "
-                f"Modbus/TCP  127.0.0.1:{plan.modbus_port}"
-            )
-            with say.status("Starting the daemon ..."):
+            with _waiting(say, "Starting the daemon ..."):
                 await _wait_listening(plan.modbus_port, alive)
-            picks = await _picks(plan, twin, cell.tools[0], say)
-            code = _sum_up(picks, twin, say)
+            say.print(f"page        http://127.0.0.1:{plan.rest_port}/ui")
+            say.print(f"REST        http://127.0.0.1:{plan.rest_port}/v1")
+            say.print(f"Modbus/TCP  127.0.0.1:{plan.modbus_port}")
+            try:
+                picks = await _picks(plan, twin, cell.tools[0], say)
+            except NotReady:
+                # when the daemon has died, its own last word tells more
+                alive()
+                raise
+            code = _sum_up(plan, picks, twin.parts_left, say)
             if not headless:
                 say.print("The daemon stays up for you to look at; Ctrl-C ends it.")
                 while alive():
@@ -163,32 +177,62 @@ async def _play(plan: Plan, headless: bool, say: Console) -> int:
     return code
 
 
+def _cancel_on_signals(say: Console) -> None:
+    """From here on Ctrl-C and SIGTERM unwind this task; the unwinding itself cannot be interrupted, and is short."""
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+
+    def stop() -> None:
+        if task is not None and not task.cancelling() and task.cancel():
+            say.print("stopping ...")
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop)
+
+
 async def _picks(plan: Plan, twin: Twin, tool: settings.Tool, say: Console) -> list[Pick]:
     """Cycles until the plan's number, the empty bin, or three without a pick in a row."""
     picks: list[Pick] = []
     barren = 0
-    async with Plc("127.0.0.1", plan.modbus_port) as plc:
-        await plc.clear(READY_S)
-        while len(picks) < (plan.cycles or 10 * plan.parts) and barren < 3:
-            recipe = 1 + len(picks) % 2
-            result = await plc.pick(recipe=recipe)
-            pick = await asyncio.to_thread(twin.move, result, recipe, tool)
-            picks.append(pick)
-            say.print(pick.sentence(len(picks)), soft_wrap=True)
-            barren = 0 if pick.part else barren + 1
-            if result.records:
-                outcome = OUTCOME_COLLISION if pick.collision else OUTCOME_OK if pick.part else OUTCOME_MISSED
-                await plc.report(result.seq, result.records[0].grasp_id, outcome)
-            if pick.code is Code.BIN_EMPTY:
-                break
+    with _waiting(say, "Waiting until the cell is ready ...") as status:
+        async with Plc("127.0.0.1", plan.modbus_port) as plc:
+            await plc.clear(READY_S)
+            say.print(f"\n{HEADING}")
+            while len(picks) < (plan.cycles or 10 * plan.parts + 1) and barren < BARREN:
+                recipe = 1 + len(picks) % 2
+                status.update("The PLC has triggered; the daemon looks ...")
+                result = await plc.pick(recipe=recipe)
+                status.update("The robot moves; what is left settles and is drawn anew ...")
+                pick = await asyncio.to_thread(_move, twin, result, recipe, tool)
+                picks.append(pick)
+                say.print(pick.row(len(picks)))
+                barren = 0 if pick.picked else barren + 1
+                if result.records:
+                    outcome = OUTCOME_COLLISION if pick.collided else OUTCOME_OK if pick.picked else OUTCOME_MISSED
+                    await plc.report(result.seq, result.records[0].grasp_id, outcome)
+                if pick.code is Code.BIN_EMPTY:
+                    break
     return picks
 
 
-def _sum_up(picks: list[Pick], twin: Twin, say: Console) -> int:
-    picked, hit = sum(bool(p.part) for p in picks), sum(p.collision for p in picks)
-    left = len(twin.world.scene().parts)
-    say.print(f"{len(picks)} cycles: {picked} parts picked, {hit} collisions, {left} parts left in the bin")
-    return 0 if picked and not hit else 1
+def _move(twin: Twin, result: PlcResult, recipe: int, tool: settings.Tool) -> Pick:
+    """Sends the tool to the first pose of a result. Raises NotReady for a pose that a robot could not use."""
+    code = Code(result.return_code)
+    if not result.records:
+        return Pick(code, recipe, result.acquire_ms, result.total_ms)
+    if result.frame != BASE_FRAME:
+        raise NotReady(f"the registers give poses in frame {result.frame}, the robot needs its base ({BASE_FRAME})")
+    T_base_tcp = result.records[0].T_frame_tcp
+    return Pick(code, recipe, result.acquire_ms, result.total_ms, T_base_tcp, twin.move(T_base_tcp, tool))
+
+
+def _sum_up(plan: Plan, picks: list[Pick], left: int, say: Console) -> int:
+    """The last line, and the exit code as `run` tells it."""
+    picked, hit = sum(p.picked for p in picks), sum(p.collided for p in picks)
+    missed = sum(p.verdict is not None for p in picks) - picked
+    state = f"{left} parts left in the bin" if left else "the bin is empty"
+    say.print(f"\n{len(picks)} cycles: {picked} parts picked, {missed} missed, {hit} collisions; {state}")
+    well = not left if picks[-1].code is Code.BIN_EMPTY else picked > 0 and len(picks) == plan.cycles
+    return 0 if well and not hit else 1
 
 
 def files(plan: Plan, folder: Path) -> settings.Cell:
@@ -202,6 +246,7 @@ def files(plan: Plan, folder: Path) -> settings.Cell:
             "right": {"address": plan.cameras[1]},
             "packet_size": 9000,
         },
+        tools=[TOOL],
         publish={"rest": {"port": plan.rest_port}, "modbus": {"host": "127.0.0.1", "port": plan.modbus_port}},
         recording={"directory": None if plan.recording is None else str(plan.recording.absolute())},
     )

@@ -14,9 +14,10 @@ import psutil
 import pytest
 
 from binpick import demo, pipeline, recording
+from binpick.errors import PortInUse
 from binpick.sim import exam
 
-PICKED = re.compile(r"^ *(\d+)  picked (\w+) +at .* true error +([-+][\d.]+) mm +([\d.]+)°", re.MULTILINE)
+PICKED = re.compile(r"^ *(\d+)  picked (\w+) .* ([-+][\d.]+) +([\d.]+)° +\d+ ms +\d+ ms$", re.MULTILINE)
 
 
 def two_free_ports() -> tuple[int, int]:
@@ -75,8 +76,31 @@ def test_a_bin_is_picked_through_every_interface(tmp_path: Path) -> None:
         assert not psutil.wait_procs(children, timeout=1)[1]
     finally:
         process.kill()
-        process.wait()
+        process.communicate()
     replays_and_picks_the_same(tmp_path)
+
+
+@pytest.mark.gige
+@pytest.mark.slow
+def test_the_demo_empties_the_bin() -> None:
+    rest, modbus = two_free_ports()
+    process = start({"parts": 4, "cameras": ("127.0.36.2", "127.0.36.3"), "rest_port": rest, "modbus_port": modbus}, True)
+    said, _ = process.communicate(timeout=90)
+    assert process.returncode == 0, said
+    assert " 102 bin_empty: The bin is empty" in said
+    assert "4 parts picked" in said
+    assert "0 collisions; the bin is empty" in said
+    # a terminal of 120 columns wraps nothing
+    assert max(map(len, said.splitlines())) <= 120
+
+
+def test_a_port_in_use_is_said_at_once(free_port: int) -> None:
+    _, modbus = two_free_ports()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", free_port))
+        other.listen()
+        with pytest.raises(PortInUse, match=f"127.0.0.1:{free_port} .* end the program"):
+            demo.run(demo.Plan(rest_port=free_port, modbus_port=modbus), headless=True)
 
 
 def replays_and_picks_the_same(tmp_path: Path) -> None:
@@ -107,4 +131,4 @@ def test_the_demo_ends_with_sigterm_while_it_starts() -> None:
         assert not psutil.wait_procs(children, timeout=1)[1]
     finally:
         process.kill()
-        process.wait()
+        process.communicate()

@@ -9,7 +9,7 @@ import typer
 def sim(
     out: Annotated[Path, typer.Option(help="Folder for the cell.yaml and rig.json that fit these cameras.")],
     world: Annotated[str, typer.Option(help="Exam world A or B.")] = "A",
-    seed: Annotated[int, typer.Option(help="How the parts fall.", min=0)] = 7,
+    seed: Annotated[int, typer.Option(help="How the parts fall.", min=0)] = 4,
 ) -> None:
     """Run two GigE Vision cameras on 127.0.0.2 and 127.0.0.3, looking into a bin of settled parts, until Ctrl-C.
 
@@ -20,6 +20,7 @@ def sim(
     from binpick import demo
     from binpick.errors import InputError
     from binpick.sim.gige import GigePair
+    from binpick.sim.twin import Twin
 
     plan = demo.Plan(world=world, seed=seed)
     try:
@@ -28,7 +29,7 @@ def sim(
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     typer.echo("Letting the parts settle ...", err=True)
-    with GigePair(demo.Twin(plan).image, plan.cameras):
+    with GigePair(Twin(world, demo.KINDS, plan.parts, seed).image, plan.cameras):
         typer.echo(f"cameras at {plan.cameras[0]} and {plan.cameras[1]}; run: binpick run --cell {out / 'cell.yaml'}")
         try:
             threading.Event().wait()
