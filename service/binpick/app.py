@@ -33,8 +33,8 @@ STOP_LIMIT_S = 2.8
 """From the first signal to exit (contract: 3 s); what has not ended by then is abandoned."""
 RECORDER_LIMIT_S = 0.5
 SWITCH_S = 0.001
-"""How long a thread may hold the interpreter while another waits for it. Beside Python loops of the cell's thread this halves
-the median of a Modbus read against Python's own 5 ms (measured)."""
+"""How long a thread may hold the interpreter while another waits for it. Beside a Python loop on the cell's thread this brings
+the median of an exchange from 5.4 ms, with Python's own 5 ms, to 1.3 ms, and its p99 from 17 ms or more to 7 ms (measured)."""
 MODBUS_PORT = 502
 """The port robots look at: simulated results never appear there."""
 
