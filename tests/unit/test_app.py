@@ -97,7 +97,9 @@ def test_a_daemon_serves_until_a_signal_and_leaves_nothing_behind(
 def test_check_finds_nothing_on_a_sound_cell(cell_file: Path) -> None:
     found = list(findings(cell_file))
     assert [finding.what for finding in found] == [
-        "cell file", "publish.rest", "publish.modbus", "rig", "recipe 1", "cameras", "a pair of images"]
+        "cell file", "publish.rest", "publish.modbus", "rig", "tool 1", "recipe 1", "cameras", "a pair of images"]
+    assert "TCP is 0, 0, 250 mm, quaternion xyzw 0, 0, 0, 1" in found[4].seen
+    assert "presses 2 mm" in found[4].seen
     assert [finding.fault for finding in found if finding.fault] == []
 
 

@@ -29,6 +29,12 @@ def test_only_a_bin_is_required():
     (BIN + "bins: []\n", "not both"),
     (BIN + "cameras: {left: {address: 1.2.3.4}}\n", "backend"),
     (BIN + "publish: {modbus: null}\n", "control is modbus"),
+    (BIN + "cameras: {backend: aravis, left: {}}\n", "cameras.left: .*address"),
+    (BIN + "cameras: {backend: files, left: l.png, right: r.png, max_skew_us: 5}\n", "max_skew_us: unknown key"),
+    (BIN + "recipes: [{tools: [1, 1]}]\n", "recipes.0.tools: .*at most 1"),
+    (BIN + "recipes: [{limits: {reach: {min_m: [0, 0, 0], max_m: [1, 1, -1]}}}]\n", "min_m must be below max_m"),
+    (BIN + "gripper: {cups: [{x_m: 0.01}]}\n", "tools.0.cups.0.x_m: .*less than or equal to 0"),
+    (BIN + "gripper: {wrist: {symmetry: 2}}\n", "wrist: unknown key"),
     (BIN.replace("[0, 0, 1]", "[0, 0, 1], rotvec_rad: [0, 0, 0], kuka_abc_deg: [0, 0, 0]"), "exactly one orientation"),
     (BIN.replace("[0, 0, 1]", "[0, 0, .nan]"), "finite"),
 ])

@@ -62,6 +62,8 @@ def findings(path: Path) -> Iterator[Finding]:
     except BinpickError as error:
         yield Finding("rig", str(cell.rig), str(error), error.exit_code)
         return
+    for tool in cell.tools:
+        yield Finding(f"tool {tool.number}", _tool(tool))
     for recipe in cell.recipes:
         yield _tried(f"recipe {recipe.number}", partial(_recipe, cell, rig, recipe.number))
     cameras = app.cameras(cell)
@@ -98,6 +100,17 @@ def _free(host: str, port: int, key: str) -> str:
 
     app.listen(host, port, key).close()
     return f"{host}:{port} is free"
+
+
+def _tool(tool: "Tool") -> str:
+    """What the robot must know of it by itself."""
+    from binpick import geometry
+
+    T_flange_tcp = tool.T_flange_tcp.T_parent_this
+    position, turn = (", ".join(f"{number:g}" for number in numbers.round(4))
+                      for numbers in (1000 * T_flange_tcp[:3, 3], geometry.quaternion(T_flange_tcp)))
+    return (f"{tool.name}: the robot's TCP is {position} mm, quaternion xyzw {turn} from its flange; its program presses "
+            f"{1000 * tool.compression_m:g} mm beyond the pose")
 
 
 def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:

@@ -63,7 +63,8 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         recorded, _ = recording.load(left.parent)
         job = settings.resolve(cell, request.recipe or recorded.request.recipe, recorded.request.bin, recorded.request.tool)
         return replace(recorded, rig=rig, job=job)
-    cameras = CameraGroup(backends.make(settings.FileCameras(backend="files", left=left, right=right)), max_skew_us=1e6)
+    files = settings.FileCameras(backend="files", left=left, right=right)
+    cameras = CameraGroup(backends.make(files), files.max_skew_us)
     deadline_ns = time.monotonic_ns() + 10_000_000_000
     cameras.open(deadline_ns)
     try:

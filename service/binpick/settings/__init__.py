@@ -4,10 +4,10 @@ from binpick.settings.cell import AravisCameras, CameraAddress, Cell, FileCamera
 from binpick.settings.file import load, parse, schema
 from binpick.settings.job import Job, resolve
 from binpick.settings.recipe import Bin, Limits, PartSize, Pose, Reach, Recipe, SegmentSettings, StereoSettings
-from binpick.settings.tool import Body, Box, Cup, Cylinder, Tool, Wrist
+from binpick.settings.tool import Body, Box, Cup, Cylinder, Tool
 
 __all__ = [
     "AravisCameras", "Bin", "Body", "Box", "CameraAddress", "Cell", "Cup", "Cylinder", "FileCameras", "Job", "Limits",
     "ModbusSettings", "PartSize", "Pose", "Publish", "Reach", "Recipe", "RestSettings", "SegmentSettings", "StereoSettings",
-    "Tool", "Wrist", "load", "parse", "resolve", "schema",
+    "Tool", "load", "parse", "resolve", "schema",
 ]

@@ -1,7 +1,8 @@
 """The whole cell: bins, tools, recipes, cameras, who controls it, where it publishes."""
 
+import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -19,6 +20,12 @@ class CameraAddress(Strict):
     """IPv4 address; opened without discovery."""
     serial: str = ""
     """Serial number, checked when given, searched when there is no address."""
+
+    @model_validator(mode="after")
+    def _given(self) -> "CameraAddress":
+        if not self.address and not self.serial:
+            raise ValueError("give the camera's address, its serial number, or both")
+        return self
 
 
 class AravisCameras(Strict):
@@ -47,8 +54,8 @@ class FileCameras(Strict):
     """The left image."""
     right: Path
     """The right image."""
-    max_skew_us: Annotated[float, Field(gt=0, le=1_000_000)] = 5000.0
-    """Kept for symmetry; files have no skew."""
+    max_skew_us: ClassVar[float] = math.inf
+    """Not a key of the file: images from disk have no skew."""
 
 
 class RestSettings(Strict):
@@ -84,7 +91,7 @@ class Recording(Strict):
     """Keeps cycles on disk."""
 
     directory: Path | None = None
-    """Every cycle's input and result are stored below this folder; null: none."""
+    """Every cycle's input and result are stored below this folder; null: none. A relative one starts where the daemon does."""
 
 
 class Cell(Strict):

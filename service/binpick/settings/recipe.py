@@ -37,12 +37,12 @@ class Bin(Strict):
 
 
 class PartSize(Strict):
-    """The parts' size, as the longest edge of what is seen of one."""
+    """The parts' size, as what is seen of one."""
 
     min_size_m: Annotated[float, Field(ge=0.002, le=1)] = 0.012
-    """Faces with a longer side below this are not offered, metres."""
+    """Faces and parts with less area than half a square of this side are dropped, metres."""
     max_size_m: Annotated[float, Field(ge=0.005, le=2)] = 0.12
-    """Segments longer than this are taken for several parts grown together, metres."""
+    """A segment longer than this may be several parts grown together: the longer, the worse it ranks, metres."""
 
 
 class StereoSettings(Strict):
@@ -95,6 +95,12 @@ class Reach(Strict):
     max_m: Position = (10.0, 10.0, 10.0)
     """Highest corner, metres."""
 
+    @model_validator(mode="after")
+    def _sound(self) -> "Reach":
+        if any(low >= high for low, high in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("min_m must be below max_m in x, y and z")
+        return self
+
 
 class Limits(Strict):
     """What is never published."""
@@ -115,8 +121,8 @@ class Recipe(Strict):
     """For people."""
     bin: Number | None = None
     """Bin to pick from; the first one when absent."""
-    tools: tuple[Number, ...] = ()
-    """Tools to pick with; the first one when empty."""
+    tools: Annotated[tuple[Number, ...], Field(max_length=1)] = ()
+    """The tool to pick with; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
     stereo: StereoSettings = StereoSettings()

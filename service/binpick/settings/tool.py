@@ -5,16 +5,18 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from binpick.settings.base import Metres, Number, Placement, Strict
+from binpick.settings.base import Number, Placement, Strict
+
+OnTheTcp = Annotated[float, Field(ge=0, le=0)]
 
 
 class Cup(Strict):
-    """A suction cup in the tool's TCP plane."""
+    """A suction cup; the TCP is the centre of its lip."""
 
-    x_m: Metres = 0.0
-    """Centre along the TCP's x, metres."""
-    y_m: Metres = 0.0
-    """Centre along the TCP's y, metres."""
+    x_m: OnTheTcp = 0.0
+    """Centre along the TCP's x, metres; 0 while a tool has one cup."""
+    y_m: OnTheTcp = 0.0
+    """Centre along the TCP's y, metres; 0 while a tool has one cup."""
     radius_m: Annotated[float, Field(ge=0.001, le=0.1)] = 0.007
     """Lip radius, uncompressed, metres."""
 
@@ -45,15 +47,6 @@ class Cylinder(Strict):
 Body = Box | Cylinder
 
 
-class Wrist(Strict):
-    """How the wrist may turn about the approach axis."""
-
-    symmetry: Annotated[int, Field(ge=0, le=12)] = 0
-    """Turns about z that look alike: 0 any angle, 1 none, 2 half turns."""
-    limits_rad: tuple[float, float] = (-3.2, 3.2)
-    """Allowed turn of the TCP's x against the bin's x, radians."""
-
-
 class Tool(Strict):
     """A suction tool; z of the TCP points out of the lips, into the part, so bodies lie at negative z."""
 
@@ -63,7 +56,7 @@ class Tool(Strict):
     kind: Literal["suction"] = "suction"
     """How it holds."""
     T_flange_tcp: Placement = Placement(position_m=(0.0, 0.0, 0.25))
-    """The TCP in the robot's flange frame."""
+    """The TCP that the robot must be given, as `binpick check` tells; poses are of the TCP and do not depend on it."""
     cups: Annotated[tuple[Cup, ...], Field(min_length=1, max_length=1)] = (Cup(),)
     """The cups."""
     bodies: Annotated[tuple[Annotated[Body, Field(discriminator="shape")], ...], Field(min_length=1)] = (
@@ -77,10 +70,8 @@ class Tool(Strict):
     lift_m: Annotated[float, Field(ge=0.005, le=1.0)] = 0.15
     """Straight way up after gripping, metres."""
     compression_m: Annotated[float, Field(ge=0, le=0.02)] = 0.002
-    """How far the robot presses the lip in beyond the pose, metres; poses lie on the surface."""
+    """How far the robot's program presses beyond the pose, metres, as `binpick check` tells; poses lie on the surface."""
     compliance_m: Annotated[float, Field(ge=0.0002, le=0.01)] = 0.0012
     """How far the lip follows a surface that is not flat, metres, either way of its fitted plane."""
     max_tilt_rad: Annotated[float, Field(ge=0, le=np.pi / 2)] = 0.6
     """Largest angle between the approach and straight down into the bin, radians."""
-    wrist: Wrist = Wrist()
-    """Freedom about the approach axis."""
