@@ -36,7 +36,7 @@ ENABLE, TRIG, RES_ACK = 1, 2, 4
 READY, ACK, NACK, BUSY, VALID, ERROR = 1, 2, 4, 8, 32, 64
 BOTH_CONNECTED, BOTH_IN_ERROR, RIGHT_IN_ERROR = 0b0101, 0b1010, 0b1001
 """Register 14: two bits a camera, left first."""
-CAMERAS, BUSY_CODE = -4, -12
+TIMEOUT, CAMERAS, BUSY_CODE = -3, -4, -12
 BACK_S = 15.0
 HELD_MS = 10_000
 """A heartbeat timeout that outlasts the start of the next daemon."""
@@ -61,8 +61,8 @@ class Cell:
     def ready(self) -> bool:
         return self.get("/v1/health/ready").status_code == 200
 
-    def cycle(self) -> httpx.Response:
-        return httpx.post(f"{self.base}/v1/cycles?wait=true", timeout=20)
+    def cycle(self, timeout_ms: int = 0) -> httpx.Response:
+        return httpx.post(f"{self.base}/v1/cycles?wait=true", json={"timeout_ms": timeout_ms}, timeout=20)
 
     def wait(self, until: Callable[[], bool], what: str, limit_s: float = BACK_S) -> float:
         """Seconds until it is so."""
@@ -246,6 +246,9 @@ def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: Gi
             assert (refused.status_code, refused.json()["code"]) == (409, BUSY_CODE)
             assert time.monotonic() - asked < 0.3
         assert answer.result().status_code == 200, answer.result().text      # unharmed by the one that was refused
+        assert cell.cycle(timeout_ms=int(500 * EXPOSURE_S)).json()["code"] == TIMEOUT
+        assert camera_reasons(cell) == []                                    # a short limit is no fault of theirs
+        cell.wait(cell.ready, "ready")
         with started(cell) as answer:
             dead = kill(gige, 0, 1)
             problem = answer.result().json()

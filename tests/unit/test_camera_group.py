@@ -10,7 +10,7 @@ import pytest
 from binpick.camera.base import MonotonicNs
 from binpick.camera.group import CameraGroup
 from binpick.data import CameraStatus, Frame, Image, Light
-from binpick.errors import CameraError, CameraLost, PairRefused
+from binpick.errors import CameraError, CameraLost, CycleTimeout, PairRefused
 from binpick.sim.camera import SimCamera
 
 LIGHT = Light(exposure_us=100.0, gain_db=0.0, projector=True)
@@ -174,6 +174,15 @@ def test_a_camera_that_still_exposes_for_a_broken_shot_is_waited_for() -> None:
     group.open(within(1))
     pair = group.capture(LIGHT, within(2))
     assert (pair.left.sequence, pair.right.sequence) == (2, 2)
+
+
+def test_a_deadline_within_the_exposure_is_no_fault_of_the_cameras() -> None:
+    group = grouped(Odd(0), Odd(1))
+    pair = group.capture(replace(LIGHT, exposure_us=50_000.0), within(0.02))
+    assert pair.left.sequence == 1
+    with pytest.raises(CycleTimeout):
+        group.capture(LIGHT, within(0))
+    assert all(status.connected and not status.error for status in group.statuses())
 
 
 def test_a_group_that_was_never_opened_says_so() -> None:

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from binpick.camera.base import Camera, Clock, MonotonicNs
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
-from binpick.errors import CameraError, PairRefused
+from binpick.errors import CameraError, Code, CycleTimeout, PairRefused
 
 T = TypeVar("T")
 COMMAND_NS = 600_000_000
@@ -48,30 +48,34 @@ class CameraGroup:
 
         Two software triggers come too far apart when the host was busy between them: then it tries again, up to three times
         in all. A dead camera is noticed within the exposure and 1.4 s, whatever the deadline is, and stays closed until `open`.
+        The deadline ends no exposure that has begun, since a healthy camera is not to be blamed for a short one: it is looked
+        at between the steps. Raises CycleTimeout then.
         """
         self._each(lambda i, camera: self._require_open(i, camera))
         # one whose shot the other's failure broke off may still expose, and would miss its next trigger
-        self._each(lambda i, camera: self._due[i] and self._fetch(i, camera, deadline_ns))
-        self._configure(light, deadline_ns)
+        self._each(lambda i, camera: self._due[i] and self._fetch(i, camera))
+        self._configure(light)
         for _ in range(TRIES):
-            pair = self._shoot(light, deadline_ns)
+            if self._clock() >= deadline_ns:
+                raise CycleTimeout(Code.TIMEOUT.message)
+            pair = self._shoot(light)
             if abs(pair.skew_us) <= self._max_skew_us:
                 return pair
         raise PairRefused(f"the images were exposed {abs(pair.skew_us):.0f} µs apart ({pair.proof}), more than the "
                           f"{self._max_skew_us:.0f} µs allowed (max_skew_us)")
 
-    def _shoot(self, light: Light, deadline_ns: MonotonicNs) -> StereoPair:
+    def _shoot(self, light: Light) -> StereoPair:
         self._sequence += 1
         captured_at = self._wall_clock().isoformat(timespec="milliseconds")
         ticks = [self._clock()]
 
         def trigger(index: int, camera: Camera) -> None:
-            camera.trigger(self._sequence, min(deadline_ns, self._clock() + COMMAND_NS))
+            camera.trigger(self._sequence, self._clock() + COMMAND_NS)
             ticks.append(self._clock())
             self._due[index] = ticks[-1] + int(light.exposure_us * 1000) + IMAGE_NS
 
         self._each(trigger)
-        left, right = self._each(lambda i, camera: self._fetch(i, camera, deadline_ns))
+        left, right = self._each(lambda i, camera: self._fetch(i, camera))
         for frame in (left, right):
             self._check(frame, ticks[0])
             frozen(frame.image)
@@ -80,10 +84,10 @@ class CameraGroup:
         skew_us, sigma_us, proof = self._skew(left, right, ticks)
         return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew_us, sigma_us=sigma_us, proof=proof)
 
-    def _fetch(self, index: int, camera: Camera, deadline_ns: MonotonicNs) -> Frame:
+    def _fetch(self, index: int, camera: Camera) -> Frame:
         """The image of its last trigger."""
         limit, self._due[index] = max(self._due[index] or 0, self._clock() + SECOND_NS), None
-        return camera.grab(self._sequence, min(deadline_ns, limit))
+        return camera.grab(self._sequence, limit)
 
     def close(self) -> None:
         """Closes both, at most 1 s each; never raises."""
@@ -104,10 +108,10 @@ class CameraGroup:
         if not self._open[index]:
             raise CameraError(self._errors[index] or f"camera {camera.name} is not open", camera.name)
 
-    def _configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
+    def _configure(self, light: Light) -> None:
         wanted = (light.exposure_us, light.gain_db, light.projector)
         if wanted != self._light:
-            self._each(lambda _, camera: camera.configure(light, min(deadline_ns, self._clock() + COMMAND_NS)))
+            self._each(lambda _, camera: camera.configure(light, self._clock() + COMMAND_NS))
             self._light = wanted
 
     def _each(self, verb: Callable[[int, Camera], T]) -> list[T]:
