@@ -123,6 +123,9 @@ def run(plan: Plan, headless: bool) -> int:
             twin = Twin(plan.world, KINDS, plan.parts, plan.seed)
         return asyncio.run(_play(plan, twin, headless, say))
     except (KeyboardInterrupt, asyncio.CancelledError):
+        # everything has ended; an impatient second Ctrl-C must not spoil that
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         say.print("stopped")
         return 0
 
@@ -240,12 +243,8 @@ def files(plan: Plan, folder: Path) -> settings.Cell:
     cell = exam.cell(
         plan.world,
         bin_frame="base",
-        cameras={
-            "backend": "aravis",
-            "left": {"address": plan.cameras[0]},
-            "right": {"address": plan.cameras[1]},
-            "packet_size": 9000,
-        },
+        cameras={"backend": "aravis", "left": {"address": plan.cameras[0]}, "right": {"address": plan.cameras[1]},
+                 "packet_size": 9000},
         tools=[TOOL],
         publish={"rest": {"port": plan.rest_port}, "modbus": {"host": "127.0.0.1", "port": plan.modbus_port}},
         recording={"directory": None if plan.recording is None else str(plan.recording.absolute())},

@@ -10,12 +10,14 @@ import time
 from pathlib import Path
 
 import httpx
+import numpy as np
 import psutil
 import pytest
+from rich.console import Console
 
 from binpick import demo, pipeline, recording
-from binpick.errors import PortInUse
-from binpick.sim import exam
+from binpick.errors import Code, PortInUse
+from binpick.sim import exam, score
 
 PICKED = re.compile(r"^ *(\d+)  picked (\w+) .* ([-+][\d.]+) +([\d.]+)° +\d+ ms +\d+ ms$", re.MULTILINE)
 
@@ -92,6 +94,30 @@ def test_the_demo_empties_the_bin() -> None:
     assert "0 collisions; the bin is empty" in said
     # a terminal of 120 columns wraps nothing
     assert max(map(len, said.splitlines())) <= 120
+
+
+def verdict(reason: str = "", penetration_m: float = 0.0) -> score.Verdict:
+    return score.Verdict(1, "block", not reason, reason, 0.0, 0.0, 0.0, penetration_m)
+
+
+@pytest.mark.parametrize(("cycles", "happened", "left", "exit_code"), [
+    (0, ["picked", "empty"], 0, 0),
+    (0, ["picked", "missed", "picked", "empty"], 0, 0),
+    (0, ["empty"], 0, 0),
+    (0, ["picked", "empty"], 1, 1),
+    (0, ["picked", "none", "none", "none"], 1, 1),
+    (2, ["picked", "missed"], 5, 0),
+    (2, ["missed", "none"], 5, 1),
+    (5, ["picked", "empty"], 0, 0),
+    (5, ["picked", "none", "none", "none"], 5, 1),
+    (2, ["picked", "hit"], 5, 1),
+])
+def test_the_exit_code_tells_how_it_went(cycles: int, happened: list[str], left: int, exit_code: int) -> None:
+    what = {"picked": (Code.OK, np.eye(4), verdict()), "missed": (Code.OK, np.eye(4), verdict("the cup is not on one part")),
+            "hit": (Code.OK, np.eye(4), verdict("the tool collides", 0.002)), "empty": (Code.BIN_EMPTY, None, None),
+            "none": (Code.ALL_COLLIDE, None, None)}
+    picks = [demo.Pick(code, 1, 1, 1, T, seen) for code, T, seen in (what[h] for h in happened)]
+    assert demo._sum_up(demo.Plan(cycles=cycles), picks, left, Console(quiet=True)) == exit_code
 
 
 def test_a_port_in_use_is_said_at_once(free_port: int) -> None:
