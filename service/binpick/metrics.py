@@ -18,6 +18,7 @@ class Facts:
 
     refused: int
     late: int
+    gate_stopped: int
     camera_failures: Mapping[str, int]
     frame_age_s: float
     ready: bool
@@ -55,6 +56,7 @@ class _Scrape(Collector):
         facts = self._facts()
         yield CounterMetricFamily("binpick_refused", "Cycles refused: busy, not ready or not in control.", facts.refused)
         yield CounterMetricFamily("binpick_late", "Results dropped because their cycle had been withdrawn.", facts.late)
+        yield CounterMetricFamily("binpick_gate_stopped", "Poses that the last gate stopped: look into it.", facts.gate_stopped)
         failures = CounterMetricFamily("binpick_camera_failures", "Failures of a camera.", labels=["camera"])
         for camera, count in facts.camera_failures.items():
             failures.add_metric([camera], count)

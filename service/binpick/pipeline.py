@@ -125,7 +125,10 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, inputs: C
 
 
 def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tuple[tuple[GraspMessage, ...], dict[str, int]]:
-    """The grasps in the frame asked for, as they leave; what the last gate stops is counted by its objection."""
+    """The grasps in the frame asked for, as they leave; what the last gate stops is counted by its objection.
+
+    That the rig is unchanged needs no check: one frozen rig came with the images, and all was computed with it.
+    """
     job = inputs.job
     T_frame_bin = frames.T_frame_bin(inputs.request.frame or job.recipe.frame)
     T_bin_frame = geometry.inverse(T_frame_bin)
@@ -134,10 +137,10 @@ def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tu
     stopped: dict[str, int] = {}
     fresh = all(f.received_ns > f.triggered_ns for f in (inputs.pair.left, inputs.pair.right))
     for grasp in kept:
-        message = _message(grasp, inputs, T_frame_bin, len(messages) + 1)
-        objection = gate.objection(message, T_bin_frame, T_reach_frame, job.bin, job.tool, job.recipe.limits)
-        if not fresh:
-            objection = "older_than_trigger"
+        objection = gate.malformed(grasp) if fresh else "older_than_trigger"
+        if not objection:
+            message = _message(grasp, inputs, T_frame_bin, len(messages) + 1)
+            objection = gate.objection(message, T_bin_frame, T_reach_frame, job.bin, job.tool, job.recipe.limits)
         if objection:
             stopped[f"gate_{objection}"] = stopped.get(f"gate_{objection}", 0) + 1
         else:

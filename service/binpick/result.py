@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from binpick import geometry
 from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
@@ -179,6 +179,18 @@ class Result(Wire):
     inputs: Inputs | None = None
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+    @model_validator(mode="after")
+    def _poses_need_a_code(self) -> "Result":
+        if self.grasps and not self.return_code.code.carries_poses:
+            raise ValueError(f"poses exist only with return codes 0 to 3, not with {self.return_code.value}")
+        return self
+
+    @property
+    def stopped(self) -> dict[str, int]:
+        """How many poses the last gate stopped, by its objection."""
+        counts = self.funnel.counts if self.funnel is not None else {}
+        return {name.removeprefix("gate_"): count for name, count in counts.items() if name.startswith("gate_")}
 
     def json_bytes(self) -> bytes:
         """The result as every interface and file carries it."""

@@ -336,6 +336,7 @@ def test_events_tell_states_and_results_and_end_with_the_cell(free_port: int) ->
                     if kind == "result":
                         served.stop()
         assert [data["cycle_id"] for kind, data in heard if kind == "result"] == [1]
+        assert all(data["age_ms"] >= 0 for kind, data in heard if kind == "result")
         states = [data["phase"] for kind, data in heard if kind == "state"]
         assert states[0] == "ready"
         assert states[-1] == "stopping"

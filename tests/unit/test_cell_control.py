@@ -57,11 +57,12 @@ def pair(triggered_ns: int, light: Light) -> StereoPair:
 
 @dataclass
 class TestCameras:
-    """Cameras of the test: `gate` holds a capture, `broken` names the camera that is dead."""
+    """Cameras of the test: `gate` holds a capture, `broken` names the camera that is dead, `stale` pairs are of long ago."""
 
     __test__ = False
     broken: str = ""
     opened: bool = False
+    stale: bool = False
     captures: list[Light] = field(default_factory=list)
     attempts: int = 0
     closed: int = 0
@@ -75,7 +76,7 @@ class TestCameras:
 
     def capture(self, light: Light, deadline_ns: int) -> StereoPair:
         self.captures.append(light)
-        triggered_ns = time.monotonic_ns()
+        triggered_ns = 1 if self.stale else time.monotonic_ns()
         self.gate.wait()
         if self.broken:
             self.opened = False
@@ -277,6 +278,20 @@ def test_dead_cameras_fail_the_cycle_by_name_then_are_opened_again() -> None:
             await until(cell, lambda s: s.phase == "ready")
             cell.start(Request(), "rest")
             await until(cell, lambda s: s.valid)
+
+    asyncio.run(scenario())
+
+
+def test_a_pair_older_than_the_cycle_is_never_computed() -> None:
+    async def scenario() -> None:
+        cameras = released()
+        cameras.stale = True
+        async with living(cameras) as cell:
+            cell.start(Request(), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            code = shown.published.result.return_code
+            assert (code.code, code.message) == (Code.CAMERAS, "the cameras gave a pair that is older than the trigger")
 
     asyncio.run(scenario())
 

@@ -1,5 +1,6 @@
 """The cell's state machine under every order of events: ids, deadlines, what is published and for how long."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import hypothesis.strategies as st
@@ -13,6 +14,7 @@ from binpick.cell.machine import State
 from binpick.data import CameraStatus
 from binpick.errors import Busy, Code, InputError, NotApplicable, NotReady
 from binpick.result import (
+    Funnel,
     GraspMessage,
     PoseMessage,
     Published,
@@ -98,6 +100,22 @@ def test_a_worker_that_saw_its_retirement_brings_nothing_and_nothing_is_counted(
     state = machine.abort(started(), 1, 0)
     state = machine.finish(state, 1, None)
     assert (state.phase, "late" in state.counts, state.counts["aborted"]) == ("ready", False, 1)
+
+
+def test_what_the_last_gate_stopped_is_counted_and_an_alarm_until_a_cycle_ends_well() -> None:
+    sound = answer(1, 0)
+    funnel = Funnel(counts={"clear": 4, "gate_out_of_reach": 2, "gate_tilt": 1, "published": 1}, dominating="gate_out_of_reach")
+    state = machine.finish(started(), 1, replace(sound, result=sound.result.model_copy(update={"funnel": funnel})))
+    assert state.faults == ("the last gate stopped 2 out of reach, 1 tilt",)
+    assert (state.counts["gate_stopped"], "internal_errors" in state.counts) == (3, False)
+    assert machine.finish(started(state), 2, answer(2, 0)).faults == ()
+
+
+def test_poses_exist_only_with_the_codes_that_carry_them() -> None:
+    for code in Code:
+        fields = {**answer(1, 0).result.model_dump(by_alias=True), "return_code": ReturnCode.of(code)}
+        with nullcontext() if code.carries_poses else pytest.raises(ValueError, match="0 to 3"):
+            Result.model_validate(fields)
 
 
 def test_only_the_running_cycle_can_be_aborted() -> None:

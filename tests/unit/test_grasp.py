@@ -94,9 +94,12 @@ def test_the_order_does_not_depend_on_the_order_of_candidates(plant, slab):
 
 
 def message(**changes):
-    pose = PoseMessage(position_m=(0.0, 0.0, 0.05), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+    position_m = changes.get("position_m", (0.0, 0.0, 0.05))
+    turn = changes.get("quaternion_xyzw", (1.0, 0.0, 0.0, 0.0))
+    behind = geometry.from_quaternion(np.array(position_m), np.array(turn)) @ geometry.translation(0.0, 0.0, -0.08)
+    before = PoseMessage(position_m=tuple(behind[:3, 3].tolist()), quaternion_xyzw=turn)
     fields = {"id": "1-1", "rank": 1, "tool": ToolMessage(number=1, name="suction", kind="suction"), "frame": "bin",
-              "position_m": pose.position_m, "quaternion_xyzw": pose.quaternion_xyzw, "T_frame_pregrasp": pose,
+              "position_m": position_m, "quaternion_xyzw": turn, "T_frame_pregrasp": before,
               "approach_m": 0.08, "lift_m": 0.15, "open_m": 0.0,
               "close_m": 0.0, "quality": 0.5, "clearance_m": 0.01, "part_id": 1,
               "sigma": Sigma(xy_m=0.001, z_m=0.001, tilt_rad=0.01)}
@@ -110,16 +113,30 @@ def message(**changes):
     ({"position_m": (0.0, 0.0, -0.03)}, "outside_bin"),
     ({"quaternion_xyzw": (0.0, 0.0, 0.0, 1.0)}, "tilt"),
     ({"position_m": (0.0, 0.09, 0.05)}, "out_of_reach"),
+    # the pose itself is within reach, where the robot would come from is not
+    ({"position_m": (0.0, 0.0, 0.11)}, "out_of_reach"),
+    ({"T_frame_pregrasp": PoseMessage(position_m=(0.0, 0.001, 0.13), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))}, "pregrasp"),
+    ({"T_frame_pregrasp": PoseMessage(position_m=(0.0, 0.0, 0.13), quaternion_xyzw=(0.0, 1.0, 0.0, 0.0))}, "pregrasp"),
 ])
 def test_the_last_gate(job, changes, objection):
     limits = job.recipe.limits.model_copy(update={"reach": job.recipe.limits.reach.model_copy(
-        update={"max_m": (10.0, 0.08, 10.0)})})
+        update={"max_m": (10.0, 0.08, 0.18)})})
     assert gate.objection(message(**changes), np.eye(4), np.eye(4), job.bin, job.tool, limits) == objection
 
 
 def test_the_last_gate_stops_what_is_not_finite(job):
     nan = message().model_copy(update={"position_m": (float("nan"), 0.0, 0.0)})
     assert gate.objection(nan, np.eye(4), np.eye(4), job.bin, job.tool, job.recipe.limits) == "not_finite"
+
+
+def test_the_last_gate_stops_what_cannot_be_written_as_a_pose(plant, slab):
+    *_, grasps, _ = found(plant([slab(0, 0, 0.06, 0.04, 0.05)]))
+    sound = replace(grasps[0], clearance_m=0.01)
+    lost, mirrored = sound.T_bin_tcp.copy(), sound.T_bin_tcp.copy()
+    lost[0, 3], mirrored[:3, 0] = np.nan, -mirrored[:3, 0]
+    assert [gate.malformed(grasp) for grasp in (
+        sound, replace(sound, T_bin_tcp=lost), replace(sound, T_bin_tcp=mirrored), replace(sound, sigma_z_m=float("inf")),
+    )] == ["", "not_finite", "quaternion", "not_finite"]
 
 
 def test_a_grasp_is_a_value(plant, slab):

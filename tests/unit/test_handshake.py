@@ -13,7 +13,7 @@ from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts,
 from binpick.publish.handshake import Phase, State
 from binpick.publish.image import Echo
 from binpick.publish.registers import Ctrl, Detail, Status
-from binpick.result import Snapshot
+from binpick.result import Published, Request, Snapshot, failure
 
 MS = 1_000_000
 ENABLE, TRIG, RES_ACK, NEXT_PAGE = Ctrl.ENABLE, Ctrl.TRIG, Ctrl.RES_ACK, Ctrl.NEXT_PAGE
@@ -404,6 +404,11 @@ def test_facts_of_a_snapshot() -> None:
     assert Facts.of(Snapshot(boot_id=1, phase="starting", owner="modbus")).fault == Code.NOT_READY
     lost = Snapshot(boot_id=1, phase="starting", owner="modbus", cameras=(CameraStatus("left", False, error="dead"),))
     assert Facts.of(lost).fault == Code.CAMERAS
+    simulated = failure(1, Request(), Code.BIN_EMPTY, simulated=True)
+    held = Published(simulated, simulated.json_bytes(), 0)
+    for valid in (True, False):     # the result's own mark counts, whatever the cameras have become since
+        shown = Snapshot(boot_id=1, phase="ready", owner="modbus", latest=held, published=held, valid=valid)
+        assert Facts.of(shown).simulated is valid
     foreign = Facts.of(Snapshot(boot_id=1, phase="ready", owner="rest"))
     assert (foreign.controlled, foreign.fault) == (False, Code.NOT_IN_CONTROL)
 

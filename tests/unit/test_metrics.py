@@ -10,7 +10,7 @@ def sample(text: str, name: str) -> float:
 
 
 def facts() -> Facts:
-    return Facts(refused=2, late=1, camera_failures={"left": 3, "right": 0}, frame_age_s=1.5, ready=True)
+    return Facts(refused=2, late=1, gate_stopped=4, camera_failures={"left": 3, "right": 0}, frame_age_s=1.5, ready=True)
 
 
 def test_counts_cycles_by_code_and_times_every_stage() -> None:
@@ -32,10 +32,11 @@ def test_asks_the_cell_at_every_scrape() -> None:
     text = metrics.text().decode()
     assert sample(text, "binpick_refused_total") == 2
     assert sample(text, "binpick_late_total") == 1
+    assert sample(text, "binpick_gate_stopped_total") == 4
     assert sample(text, 'binpick_camera_failures_total{camera="left"}') == 3
     assert sample(text, "binpick_frame_age_seconds") == 1.5
     assert sample(text, "binpick_ready") == 1
-    now[0] = Facts(refused=3, late=1, camera_failures={}, frame_age_s=math.nan, ready=False)
+    now[0] = Facts(refused=3, late=1, gate_stopped=4, camera_failures={}, frame_age_s=math.nan, ready=False)
     text = metrics.text().decode()
     assert sample(text, "binpick_refused_total") == 3
     assert math.isnan(sample(text, "binpick_frame_age_seconds"))

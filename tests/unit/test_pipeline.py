@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from binpick import geometry, pipeline, recording
-from binpick.data import StereoPair
+from binpick.data import Grasp, StereoPair
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
 from binpick.lab import exam
 from binpick.result import CycleInput, PoseMessage, Request
@@ -119,6 +119,33 @@ def test_a_rig_on_the_flange_needs_and_uses_its_pose(paper):
     on_flange = pipeline.run(replace(paper.inputs, rig=rig, request=asked.model_copy(update={"T_base_flange": flange})))
     fixed = pipeline.run(replace(paper.inputs, request=asked))
     assert np.allclose(pose(on_flange.result.grasps[0]), pose(fixed.result.grasps[0]), atol=1e-9)
+
+
+def test_poses_out_of_reach_are_stopped_and_counted(paper, outcome):
+    limits = paper.inputs.job.recipe.limits
+    nowhere = limits.reach.model_copy(update={"min_m": (9.0, 9.0, 9.0)})
+    recipe = paper.inputs.job.recipe.model_copy(update={"limits": limits.model_copy(update={"reach": nowhere})})
+    result = pipeline.run(replace(paper.inputs, job=paper.inputs.job.model_copy(update={"recipe": recipe}))).result
+    assert result.return_code.code is Code.ALL_OUT_OF_REACH
+    assert result.stopped == {"out_of_reach": len(outcome.result.grasps)}
+    assert not result.grasps
+
+
+def test_poses_of_a_pair_older_than_its_trigger_are_stopped(paper):
+    stale = replace(paper.inputs.pair.right, received_ns=paper.inputs.pair.right.triggered_ns)
+    result = pipeline.run(replace(paper.inputs, pair=replace(paper.inputs.pair, right=stale))).result
+    assert result.return_code.code is Code.ALL_OUT_OF_REACH
+    assert set(result.stopped) == {"older_than_trigger"}
+
+
+def test_a_pose_that_is_none_costs_itself_alone(paper):
+    T_bin_tcp = geometry.from_quaternion(np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0]))
+    sound = Grasp(T_bin_tcp=T_bin_tcp, tool=1, part_id=1, close_m=0.0, quality=0.5, seal_m=0.0, room=1.0,
+                  sigma_xy_m=1e-4, sigma_z_m=1e-4, sigma_tilt_rad=0.01, clearance_m=0.01)
+    lost = replace(sound, T_bin_tcp=np.full((4, 4), np.nan))
+    messages, counts = pipeline._publishable([lost, sound], paper.inputs, pipeline._Frames.of(paper.inputs))
+    assert [message.id for message in messages] == ["1-1"]
+    assert counts == {"gate_not_finite": 1, "published": 1}
 
 
 def test_time_can_run_out_between_stages(paper):

@@ -115,7 +115,8 @@ def acquired(state: State, cycle_id: int) -> State:
 def finish(state: State, cycle_id: int, published: Published | None, fault: str = "") -> State:
     """The worker came back and the slot is free; None when it brings nothing because its id was retired meanwhile.
 
-    A result of a retired id is dropped and counted. `fault` stays latched until a cycle ends well.
+    A result of a retired id is dropped and counted. `fault`, or that the last gate had to stop a pose, stays latched until a
+    cycle ends well.
     """
     retired = state.running is None or state.running.cycle_id != cycle_id
     if state.ticket is not None and state.ticket.cycle_id == cycle_id:
@@ -127,9 +128,12 @@ def finish(state: State, cycle_id: int, published: Published | None, fault: str 
     if published.result.return_code.code is Code.CAMERAS:
         state = _count(state, "camera_failures")
     if fault:
-        state = replace(_count(state, "internal_errors"), faults=(fault,))
-    elif published.result.return_code.value >= 0:
-        state = replace(state, faults=())
+        state = _count(state, "internal_errors")
+    if stopped := published.result.stopped:
+        state = _count(state, "gate_stopped", sum(stopped.values()))
+        fault = "the last gate stopped " + ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in stopped.items())
+    if fault or published.result.return_code.value >= 0:
+        state = replace(state, faults=(fault,) if fault else ())
     return _publish(state, published)
 
 
@@ -242,8 +246,8 @@ def _invalidate(state: State, why: str) -> State:
     return replace(state, valid=False, withdrawn=why) if state.valid else state
 
 
-def _count(state: State, name: str) -> State:
-    return replace(state, counts=MappingProxyType({**state.counts, name: state.counts.get(name, 0) + 1}))
+def _count(state: State, name: str, by: int = 1) -> State:
+    return replace(state, counts=MappingProxyType({**state.counts, name: state.counts.get(name, 0) + by}))
 
 
 def _cameras_down(state: State) -> str:

@@ -13,7 +13,7 @@ from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
 from binpick.cell.machine import State, Ticket
 from binpick.data import CameraStatus, Light, StereoPair
-from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout
+from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout, PairRefused
 from binpick.recording import Recorder
 from binpick.result import CycleInput, CycleResult, Published, Result, failure
 from binpick.rig import Rig
@@ -123,6 +123,8 @@ class Worker:
             return
         log.info("cycle %d: %d %s, %d grasps, %.0f ms", ticket.cycle_id, result.return_code.value, result.return_code.name,
                  len(result.grasps), (finished_ns - ticket.started_ns) / 1e6)
+        if result.stopped:
+            log.error("cycle %d: %s", ticket.cycle_id, "; ".join(state.faults))
         if self.recorder is not None and inputs is not None:
             self.recorder.offer(inputs, result)
 
@@ -130,6 +132,8 @@ class Worker:
         recipe = ticket.job.recipe
         self._proceed(ticket)
         pair = self.cameras.capture(Light(recipe.exposure_us, recipe.gain_db, recipe.projector), ticket.deadline_ns)
+        if _triggered_ns(pair) < ticket.started_ns:
+            raise PairRefused("the cameras gave a pair that is older than the trigger")
         simulated = any(status.simulated for status in self.cameras.statuses())
         self.board.step(machine.acquired, ticket.cycle_id)
         return CycleInput(ticket.cycle_id, pair, self.rig, ticket.job, ticket.request, simulated)

@@ -1,12 +1,13 @@
 """The cell's changes as they happen: for code an iteration over snapshots, for clients server-sent events."""
 
+import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 
 from fastapi.sse import ServerSentEvent
 
 from binpick.publish.ports import View
-from binpick.publish.wire import State
+from binpick.publish.wire import State, age_ms
 from binpick.result import Snapshot
 
 
@@ -39,5 +40,6 @@ async def stream(view: View) -> AsyncIterator[ServerSentEvent]:
             if latest is not None and latest.result.cycle_id != told:
                 told = latest.result.cycle_id
                 if not first:
-                    yield ServerSentEvent(event="result", id=str(told), raw_data=latest.result.model_dump_json(by_alias=True))
+                    result = latest.result.model_copy(update={"age_ms": age_ms(latest, time.monotonic_ns())})
+                    yield ServerSentEvent(event="result", id=str(told), raw_data=result.model_dump_json(by_alias=True))
             first = False

@@ -40,7 +40,8 @@ class Facts:
                    acquired=snapshot.acquired, finished=latest.cycle_id if latest else 0,
                    code=latest.return_code.value if latest else 0,
                    valid=latest is not None and published is not None and published.cycle_id == latest.cycle_id,
-                   grasps=len(latest.grasps) if latest else 0, degraded=bool(snapshot.faults), simulated=snapshot.simulated)
+                   grasps=len(latest.grasps) if latest else 0, degraded=bool(snapshot.faults),
+                   simulated=snapshot.simulated or (published is not None and published.simulated))
 
 
 @dataclass(frozen=True, slots=True)

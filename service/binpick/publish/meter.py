@@ -32,6 +32,6 @@ def facts(view: View) -> Facts:
     latest = snapshot.latest
     age_s = math.nan if latest is None or latest.result.captured_at is None else (
         (time.monotonic_ns() - latest.triggered_ns) / NS_PER_S)
-    return Facts(refused=counts.get("refused", 0), late=counts.get("late", 0), frame_age_s=age_s,
-                 camera_failures={camera.name: camera.failures for camera in snapshot.cameras},
+    return Facts(refused=counts.get("refused", 0), late=counts.get("late", 0), gate_stopped=counts.get("gate_stopped", 0),
+                 frame_age_s=age_s, camera_failures={camera.name: camera.failures for camera in snapshot.cameras},
                  ready=snapshot.phase == "ready")

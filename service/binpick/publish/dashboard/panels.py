@@ -12,7 +12,8 @@ ROWS = 6
 SUMS = ("total", "compute")
 """Times that are sums of others."""
 COUNTS = {"finished": "cycles", "refused": "refused", "aborted": "aborted", "timeouts": "timed out", "late": "late",
-          "camera_failures": "camera faults", "expired": "expired", "internal_errors": "errors"}
+          "camera_failures": "camera faults", "expired": "expired", "gate_stopped": "stopped at gate",
+          "internal_errors": "errors"}
 
 
 def banner(shown: Banner, snapshot: Snapshot) -> str:
