@@ -33,3 +33,9 @@ def test_help_imports_nothing_heavy() -> None:
     probe = f"import sys, binpick.cli; print([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(("address", "says", "code"), [("5020", "HOST:PORT", 2), ("127.0.0.1:1", "no Modbus server", 1)])
+def test_bench_says_why_a_daemon_cannot_be_timed(monkeypatch, capsys, address, says, code) -> None:
+    assert call(monkeypatch, "bench", "--modbus", address) == code
+    assert says in capsys.readouterr().err
