@@ -332,6 +332,18 @@ def test_two_cameras_killed_in_mid_cycle_fail_it_within_two_seconds_by_name(fail
     asyncio.run(scenario())
 
 
+def test_cameras_that_stay_away_are_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    async def scenario() -> None:
+        cameras = TestCameras(broken="left")
+        async with living(cameras, ready=False):
+            while cameras.attempts < 3:
+                await asyncio.sleep(0.01)
+
+    asyncio.run(scenario())
+    assert [record.getMessage() for record in caplog.records if "not open" in record.getMessage()] == [
+        "cameras not open: camera left is dead"]
+
+
 def test_an_error_of_ours_fails_one_cycle_and_stays_visible_until_a_good_one() -> None:
     failing = [True]
 

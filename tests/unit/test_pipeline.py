@@ -140,8 +140,8 @@ def test_poses_of_a_pair_older_than_its_trigger_are_stopped(paper):
 
 def test_a_pose_that_is_none_costs_itself_alone(paper):
     T_bin_tcp = geometry.from_quaternion(np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0]))
-    sound = Grasp(T_bin_tcp=T_bin_tcp, tool=1, part_id=1, close_m=0.0, quality=0.5, seal_m=0.0, room=1.0,
-                  sigma_xy_m=1e-4, sigma_z_m=1e-4, sigma_tilt_rad=0.01, clearance_m=0.01)
+    sound = Grasp(T_bin_tcp=T_bin_tcp, tool=1, part_id=1, open_m=0.0, close_m=0.0, quality=0.5, seal_m=0.0,
+                  room=1.0, sigma_xy_m=1e-4, sigma_z_m=1e-4, sigma_tilt_rad=0.01, clearance_m=0.01)
     lost = replace(sound, T_bin_tcp=np.full((4, 4), np.nan))
     messages, counts = pipeline._publishable([lost, sound], paper.inputs, pipeline._Frames.of(paper.inputs))
     assert [message.id for message in messages] == ["1-1"]

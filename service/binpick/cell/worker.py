@@ -89,7 +89,8 @@ class Worker:
                 self.cameras.open(self.clock() + int(OPEN_LIMIT_S * 1e9))
                 log.info("cameras open: %s", ", ".join(f"{c.name} {c.model} {c.serial}" for c in self.cameras.statuses()))
         except CameraError as error:
-            log.warning("cameras not open: %s", error)
+            if _errors(self.cameras.statuses()) != _errors(state.cameras):     # not again at every attempt
+                log.warning("cameras not open: %s", error)
         except Exception:
             log.exception("unexpected, outside a cycle")
             self.board.step(machine.stumble, INTERNAL_ERROR)
@@ -174,6 +175,10 @@ def thread(worker: Worker) -> threading.Thread:
 
 def _wanted(state: State) -> bool:
     return state.stopping or state.ticket is not None
+
+
+def _errors(cameras: tuple[CameraStatus, ...]) -> tuple[str, ...]:
+    return tuple(camera.error for camera in cameras)
 
 
 def _triggered_ns(pair: StereoPair) -> MonotonicNs:
