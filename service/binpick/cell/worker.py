@@ -89,7 +89,7 @@ class Worker:
                 self.cameras.open(self.clock() + int(OPEN_LIMIT_S * 1e9))
                 log.info("cameras open: %s", ", ".join(f"{c.name} {c.model} {c.serial}" for c in self.cameras.statuses()))
         except CameraError as error:
-            if _errors(self.cameras.statuses()) != _errors(state.cameras):     # not again at every attempt
+            if attempts == 1 or _errors(self.cameras.statuses()) != _errors(state.cameras):     # not again at every attempt
                 log.warning("cameras not open: %s", error)
         except Exception:
             log.exception("unexpected, outside a cycle")
