@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from binpick import geometry
 from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
@@ -20,6 +20,9 @@ from binpick.settings import Job
 Triple = tuple[float, float, float]
 Xyzw = tuple[float, float, float, float]
 FrameName = Literal["camera", "bin", "base"]
+Phase = Literal["starting", "ready", "acquiring", "computing", "stopping"]
+Source = Literal["modbus", "rest"]
+Owner = Literal["modbus", "rest", "none"]
 
 
 class Wire(BaseModel):
@@ -33,6 +36,13 @@ class PoseMessage(Wire):
 
     position_m: Triple
     quaternion_xyzw: Xyzw
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def _unit(cls, turn: Xyzw) -> Xyzw:
+        if abs(np.linalg.norm(turn) - 1) > 1e-3:     # what rounding to three digits leaves
+            raise ValueError("a quaternion must have length 1 (within 0.001)")
+        return turn
 
 
 class Request(Wire):
@@ -269,13 +279,13 @@ class Artefact:
 class Snapshot:
     """Everything the interfaces may show, at one instant; replaced whole, never changed.
 
-    `phase` is one of starting, ready, acquiring, computing, stopping. `current` is the cycle in flight (0: none);
+    `current` is the cycle in flight (0: none);
     `published` is the result that holds until it is acknowledged, withdrawn, too old, or replaced: `valid` says whether it
     does, `withdrawn` why not. `latest` is the last finished cycle whatever became of it.
     """
 
     boot_id: int
-    phase: Literal["starting", "ready", "acquiring", "computing", "stopping"] = "starting"
+    phase: Phase = "starting"
     current: int = 0
     acquired: bool = False
     published: Published | None = None
@@ -284,6 +294,6 @@ class Snapshot:
     latest: Published | None = None
     cameras: tuple[CameraStatus, ...] = ()
     faults: tuple[str, ...] = ()
-    owner: Literal["modbus", "rest", "none"] = "none"
+    owner: Owner = "none"
     simulated: bool = False
     counts: tuple[tuple[str, int], ...] = ()

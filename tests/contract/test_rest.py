@@ -197,6 +197,8 @@ def test_refusals_are_problems_with_the_cells_code(free_port: int) -> None:
         problem(served.post(frame="base"), 422, Code.FRAME_UNAVAILABLE)
         assert "unknown key" in problem(served.post(recipy=1), 422, Code.BAD_ARGUMENT)["detail"]
         assert "body.max_grasps" in problem(served.post(max_grasps=99), 422, Code.BAD_ARGUMENT)["detail"]
+        bent = {"position_m": [0, 0, 1], "quaternion_xyzw": [0, 0, 0, 0]}
+        assert "length 1" in problem(served.post(T_base_flange=bent), 422, Code.BAD_ARGUMENT)["detail"]
         problem(served.client.post("/v1/cycles", content=b"{", headers={"content-type": "application/json"}), 422,
                 Code.BAD_ARGUMENT)
         problem(served.client.get("/v1/cycles/latest"), 404, Code.NOT_APPLICABLE)

@@ -1,12 +1,15 @@
 """The command line: faults are one line, help is light."""
 
+import importlib
 import subprocess
 import sys
 
 import pytest
 
 from binpick import cli
+from binpick.errors import InputError
 
+pick = importlib.import_module("binpick.cli.pick")    # the package shows the command of that name
 HEAVY = ("open3d", "nicegui", "cv2", "distributed", "mujoco", "fastapi", "uvicorn")
 
 
@@ -27,6 +30,19 @@ def test_a_fault_is_one_line_that_says_what_to_do(monkeypatch: pytest.MonkeyPatc
 def test_check_exits_with_the_worst_finding(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert call(monkeypatch, "check", "--cell", "nowhere.yaml") == 2
     assert "FAIL" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("given", "says"), [("1 2 3", "seven numbers"), ("1 2 3 0 0 0 x", "seven numbers"),
+                                             ("0 0 1 0 0 0 2", "length 1"), ("nan 0 1 0 0 0 1", "finite")])
+def test_a_flange_pose_that_is_none_is_refused(given: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        pick._flange(given)
+
+
+def test_a_flange_pose_is_seven_numbers() -> None:
+    flange = pick._flange("0.1 0.2 0.3, 0 0 0 1")
+    assert flange is not None
+    assert (flange.position_m, flange.quaternion_xyzw) == ((0.1, 0.2, 0.3), (0, 0, 0, 1))
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -97,7 +97,7 @@ def message(**changes):
     position_m = changes.get("position_m", (0.0, 0.0, 0.05))
     turn = changes.get("quaternion_xyzw", (1.0, 0.0, 0.0, 0.0))
     behind = geometry.from_quaternion(np.array(position_m), np.array(turn)) @ geometry.translation(0.0, 0.0, -0.08)
-    before = PoseMessage(position_m=tuple(behind[:3, 3].tolist()), quaternion_xyzw=turn)
+    before = PoseMessage(position_m=tuple(behind[:3, 3].tolist()), quaternion_xyzw=tuple(geometry.quaternion(behind).tolist()))
     fields = {"id": "1-1", "rank": 1, "tool": ToolMessage(number=1, name="suction", kind="suction"), "frame": "bin",
               "position_m": position_m, "quaternion_xyzw": turn, "T_frame_pregrasp": before,
               "approach_m": 0.08, "lift_m": 0.15, "open_m": 0.0,

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Concatenate, ParamSpec
 
 from binpick.cell import machine
-from binpick.cell.machine import Owner, State
-from binpick.result import Snapshot
+from binpick.cell.machine import State
+from binpick.result import Owner, Snapshot
 
 P = ParamSpec("P")
 

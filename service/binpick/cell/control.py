@@ -14,7 +14,7 @@ from binpick.cell.gallery import Gallery
 from binpick.cell.worker import Cameras, Run, Worker
 from binpick.errors import CycleRefused, NotInControl
 from binpick.recording import Recorder
-from binpick.result import Artefact, Published, Request, Snapshot
+from binpick.result import Artefact, Published, Request, Snapshot, Source
 from binpick.rig import Rig
 
 STOP_LIMIT_S = 2.0
@@ -58,7 +58,7 @@ class Cell:
         """A picture or the cloud of the last cycle; takes tens of milliseconds."""
         return self._gallery.artefact(cycle_id, name)
 
-    def start(self, request: Request, source: machine.Source) -> int:
+    def start(self, request: Request, source: Source) -> int:
         """Starts a cycle and returns its id at once.
 
         Raises NotInControl, NotReady, Busy, UnknownItem, FrameUnavailable, FlangePoseMissing; nothing has changed then.
@@ -73,22 +73,22 @@ class Cell:
             self._board.step(machine.refused)
             raise
 
-    def abort(self, cycle_id: int, source: machine.Source) -> None:
+    def abort(self, cycle_id: int, source: Source) -> None:
         """Retires a running cycle (−26)."""
         self._admit(source)
         self._board.step(machine.abort, cycle_id, self._clock())
 
-    def acknowledge(self, cycle_id: int, source: machine.Source) -> None:
+    def acknowledge(self, cycle_id: int, source: Source) -> None:
         """The controller has read the published result."""
         self._admit(source)
         self._board.step(machine.acknowledge, cycle_id)
 
-    def withdraw(self, reason: str, source: machine.Source) -> None:
+    def withdraw(self, reason: str, source: Source) -> None:
         """Takes back what is published or running."""
         self._admit(source)
         self._board.step(machine.withdraw, reason, self._clock())
 
-    def report(self, cycle_id: int, grasp: int, outcome: int, source: machine.Source) -> None:
+    def report(self, cycle_id: int, grasp: int, outcome: int, source: Source) -> None:
         """What became of a grasp."""
         self._admit(source)
         self._board.step(machine.report, cycle_id, grasp, outcome)
@@ -133,7 +133,7 @@ class Cell:
                         traceback: TracebackType | None) -> None:
         await self.close()
 
-    def _admit(self, source: machine.Source) -> None:
+    def _admit(self, source: Source) -> None:
         owner = self._settings.control
         if source != owner:
             raise NotInControl(f"this cell is controlled by {owner}, not by {source}: "

@@ -8,16 +8,11 @@ back is dropped and counted.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal
 
 from binpick.data import CameraStatus
 from binpick.errors import Busy, Code, InputError, NotApplicable, NotReady
-from binpick.result import Published, Request, Snapshot, failure
+from binpick.result import Owner, Phase, Published, Request, Snapshot, failure
 from binpick.settings import Job
-
-Phase = Literal["starting", "ready", "acquiring", "computing", "stopping"]
-Source = Literal["modbus", "rest"]
-Owner = Literal["modbus", "rest", "none"]
 
 KEPT = 16
 """Finished results in memory, and the ones whose outcomes may be reported (CONTRACTS §6)."""

@@ -11,7 +11,7 @@ def bench(
     cycles: Annotated[int, typer.Option(help="Timed cycles per scene.", min=1, max=100)] = 2,
     textbook: Annotated[bool, typer.Option(help="Also run the textbook pipeline (6 s a cycle).")] = True,
     tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
-    modbus: Annotated[str, typer.Option(metavar="HOST:PORT", help="Instead, time a running daemon's Modbus reads (20 s).")] = "",
+    modbus: Annotated[str, typer.Option(metavar="HOST:PORT", help="Time a daemon's Modbus reads instead (20 s).")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Sit the exam: depth, first grasps and times against the simulator's ground truth."""

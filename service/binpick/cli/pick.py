@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from binpick.result import CycleInput, CycleResult, Request
+    from binpick.result import CycleInput, CycleResult, PoseMessage, Request
     from binpick.rig import Rig
     from binpick.settings import Cell
 
@@ -21,6 +21,8 @@ def pick(
     cell: Annotated[Path, typer.Option(help="Cell file: bin, tool, recipe.")],
     out: Annotated[Path, typer.Option(help="Folder for result.json, cloud.ply and overlay.png.")],
     recipe: Annotated[int, typer.Option(help="Recipe number; 0: the first.", min=0, max=65535)] = 0,
+    flange_pose: Annotated[str, typer.Option(metavar="'X Y Z QX QY QZ QW'", help="Flange in base, metres and quaternion, for a "
+                                             "rig that rides on it.")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the result instead of a summary.")] = False,
 ) -> None:
     """Find grasps in one stereo pair.
@@ -35,7 +37,7 @@ def pick(
     loaded_rig, warnings = rig_file.load(rig)
     for warning in warnings:
         typer.echo(warning, err=True)
-    inputs = _inputs(left, right, loaded_rig, settings.load(cell), Request(recipe=recipe))
+    inputs = _inputs(left, right, loaded_rig, settings.load(cell), Request(recipe=recipe, T_base_flange=_flange(flange_pose)))
     outcome = pipeline.run(inputs)
     write(out, {"result.json": outcome.result.json_bytes(),
                  **{name: artefacts.render(inputs, outcome, name)[1] for name in PICTURES}})
@@ -45,6 +47,24 @@ def pick(
         _tell(outcome, out)
     if not outcome.result.return_code.code.carries_poses:
         raise typer.Exit(1)
+
+
+def _flange(numbers: str) -> "PoseMessage | None":
+    """The pose of seven numbers; None of none. Raises InputError."""
+    from pydantic import ValidationError
+
+    from binpick.errors import InputError
+    from binpick.result import PoseMessage
+
+    if not numbers:
+        return None
+    try:
+        x, y, z, qx, qy, qz, qw = map(float, numbers.replace(",", " ").split())
+        return PoseMessage(position_m=(x, y, z), quaternion_xyzw=(qx, qy, qz, qw))
+    except ValidationError as error:
+        raise InputError(f"--flange-pose {numbers}: {error.errors()[0]['msg']}") from error
+    except ValueError as error:
+        raise InputError(f"--flange-pose {numbers}: write it as seven numbers: x y z in metres, quaternion x y z w") from error
 
 
 def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request") -> "CycleInput":
@@ -62,7 +82,8 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         typer.echo(f"{left.parent} is a recording: its cycle and request are used", err=True)
         recorded, _ = recording.load(left.parent)
         job = settings.resolve(cell, request.recipe or recorded.request.recipe, recorded.request.bin, recorded.request.tool)
-        return replace(recorded, rig=rig, job=job)
+        flange = request.T_base_flange or recorded.request.T_base_flange
+        return replace(recorded, rig=rig, job=job, request=recorded.request.model_copy(update={"T_base_flange": flange}))
     files = settings.FileCameras(backend="files", left=left, right=right)
     cameras = CameraGroup(backends.make(files), files.max_skew_us)
     deadline_ns = time.monotonic_ns() + 10_000_000_000

@@ -1,13 +1,11 @@
 """All that a publisher knows of the cell: what it may read, and what it may ask for."""
 
 import asyncio
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-from binpick.result import Artefact, Published, Request, Snapshot
+from binpick.result import Artefact, Published, Request, Snapshot, Source
 
 __all__ = ["Artefact", "Control", "Source", "View"]
-
-Source = Literal["modbus", "rest"]
 
 
 @runtime_checkable

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from binpick.data import CameraStatus
-from binpick.result import Published, Snapshot, Wire
+from binpick.result import Owner, Phase, Published, Snapshot, Wire
 
 NS_PER_MS = 1_000_000
 UNKNOWN_AGE = b'\n "age_ms": null'
@@ -29,7 +29,7 @@ class State(Wire):
     """The cell at one instant, as /v1/events tells it."""
 
     boot_id: int
-    phase: Literal["starting", "ready", "acquiring", "computing", "stopping"]
+    phase: Phase
     cycle_id: int
     """The cycle in flight; 0: none."""
     acquired: bool
@@ -40,7 +40,7 @@ class State(Wire):
     """The published result holds."""
     withdrawn: str
     """Why it does not."""
-    owner: Literal["modbus", "rest", "none"]
+    owner: Owner
     simulated: bool
     faults: tuple[str, ...]
     cameras: tuple[CameraStatus, ...]
