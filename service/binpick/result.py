@@ -4,6 +4,7 @@ A `Result` is made once per cycle and serialised once to bytes; REST sends those
 object. Lengths are metres, angles radians, times milliseconds where the name says so.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -40,7 +41,7 @@ class PoseMessage(Wire):
     @field_validator("quaternion_xyzw")
     @classmethod
     def _unit(cls, turn: Xyzw) -> Xyzw:
-        if abs(np.linalg.norm(turn) - 1) > 1e-3:     # what rounding to three digits leaves
+        if abs(math.hypot(*turn) - 1) > 1e-3:     # what rounding to three digits leaves
             raise ValueError("a quaternion must have length 1 (within 0.001)")
         return turn
 
