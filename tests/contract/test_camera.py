@@ -324,7 +324,7 @@ def test_found_by_serial_number(gige: GigePair) -> None:
     right.open(within(5))
     assert right.status().address == gige.identities[1].address
     right.close()
-    left, _ = backends.make(AravisCameras(left=CameraAddress(serial="NOSUCH"), right=CameraAddress()))
+    left, _ = backends.make(AravisCameras(left=CameraAddress(serial="NOSUCH"), right=CameraAddress(serial="NOSUCH")))
     with pytest.raises(CameraNotFound, match="no camera with serial number 'NOSUCH'"):
         left.open(within(5))
 
