@@ -1,6 +1,6 @@
 """The composition root: settings become cameras, a cell and its servers; the only asyncio.run and the only signal handlers.
 
-Everything stops in the reverse order of its start (DESIGN §5a): READY falls and waiters end, the cell gives the cameras back,
+Everything stops in the reverse order of its start: READY falls and waiters end, the cell gives the cameras back,
 the servers close, the recorder empties its queue. A driver stuck in C cannot hold the exit.
 """
 

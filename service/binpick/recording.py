@@ -28,7 +28,7 @@ from binpick.result import CycleInput, Request, Result, Wire
 from binpick.settings import Job
 
 QUEUE = 2
-"""Cycles that may wait for the disk (DESIGN §5a); a full-resolution one holds 5 MB."""
+"""Cycles that may wait for the disk; a full-resolution one holds 5 MB."""
 PNG_EFFORT = 1
 """Of zlib's 9: four times faster than OpenCV's own choice for a tenth more bytes."""
 

@@ -15,9 +15,9 @@ from binpick.result import Owner, Phase, Published, Request, Snapshot, failure
 from binpick.settings import Job
 
 KEPT = 16
-"""Finished results in memory, and the ones whose outcomes may be reported (CONTRACTS §6)."""
+"""Finished results in memory, and the ones whose outcomes may be reported."""
 OUTCOMES = range(1, 8)
-"""1 ok, 2 missed, 3 dropped, 4 collision, 5 skipped, 6 double, 7 unreachable (CONTRACTS §6)."""
+"""1 ok, 2 missed, 3 dropped, 4 collision, 5 skipped, 6 double, 7 unreachable."""
 
 
 @dataclass(frozen=True, slots=True)
