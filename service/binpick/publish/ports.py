@@ -57,5 +57,5 @@ class Control(Protocol):
         ...
 
     def report(self, cycle_id: int, grasp: int, outcome: int, source: Source) -> None:
-        """What became of a grasp (1 ok, 2 missed, ... as in wire.Outcome); idempotent; raises NotApplicable for unknown ones."""
+        """What became of a grasp (numbers as in wire.Outcome); idempotent; raises NotApplicable for unknown ones."""
         ...
