@@ -39,8 +39,6 @@ from binpick.stereo import cloud, filter, match, rectify
 
 LEAST_MEASURED = 0.20
 """Below this share of measured pixels in the window there is no depth to speak of."""
-EXACT_CHECKS = 40
-"""Candidates whose exact clearance is computed before giving up: they are in order of quality."""
 
 Proceed = Callable[[], None]
 
@@ -113,7 +111,7 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, inputs: C
     scene = clearance.obstacles(heights, job.bin)
     kept: list[Grasp] = []
     collide = int(sieve.sum())
-    for grasp in ordered[:EXACT_CHECKS]:
+    for grasp in ordered:
         distance_m = clearance.clearance(grasp, job.tool, scene)
         if distance_m < job.recipe.limits.margin_m:
             collide += 1
