@@ -296,7 +296,7 @@ def test_a_pair_older_than_the_cycle_is_never_computed() -> None:
     asyncio.run(scenario())
 
 
-@pytest.mark.parametrize("fail", ["dead", "stuck"])
+@pytest.mark.parametrize("fail", ["dead", pytest.param("stuck", marks=pytest.mark.slow)])
 def test_two_cameras_killed_in_mid_cycle_fail_it_within_two_seconds_by_name(fail: Literal["dead", "stuck"]) -> None:
     exposing = threading.Event()
 

@@ -36,6 +36,7 @@ def test_a_shot_is_reproducible_and_no_two_are_alike(renderer, scene):
     assert abs(float(first.mean()) - float(other.mean())) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["A", "B"])
 def test_no_part_is_seen_outside_its_silhouette(world):
     kinds = list(exam.KINDS)
