@@ -33,7 +33,7 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-check: $(STAMP)  ## lint, types, contracts, unit and contract tests, one in-process cycle (90 s)
+check: $(STAMP)  ## lint, types, contracts, unit and contract tests, one in-process cycle (under 2 minutes)
 	@$(MAKE) --no-print-directory --jobs=2 lint fast
 
 fast:
