@@ -19,7 +19,6 @@ Triple = tuple[float, float, float]
 TUNING_SEEDS = tuple(range(1, 11))
 REPORT_SEEDS = tuple(range(101, 111))
 IMAGE_SIZE_PX = (1936, 1216)
-PIXEL_UM = 3.45
 
 
 @dataclass(frozen=True, slots=True)

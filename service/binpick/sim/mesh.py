@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from jaxtyping import Float, Float32, Int, Int32, UInt32
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt32
 
 from binpick import geometry
 from binpick.sim import exam
@@ -62,9 +62,9 @@ class Caster:
         index = np.minimum(answer["geometry_ids"].numpy(), len(self._part_ids) - 1)
         return Hits(answer["t_hit"].numpy(), self._part_ids[index], answer["primitive_normals"].numpy())
 
-    def blocked(self, rays: Rays, start: float, end: float) -> np.ndarray:
+    def blocked(self, rays: Rays, start: float, end: float) -> Bool[np.ndarray, "n"]:
         """Whether something stands on each ray between `start` and `end` ray lengths."""
-        answer: np.ndarray = self._scene.test_occlusions(_tensor(rays), tnear=start, tfar=end).numpy()
+        answer: Bool[np.ndarray, "n"] = self._scene.test_occlusions(_tensor(rays), tnear=start, tfar=end).numpy()
         return answer
 
 

@@ -9,11 +9,12 @@ from binpick.settings import StereoSettings
 from binpick.stereo.match import SCALE, Matched
 
 SGBM_SIGMA_PX = 0.25
-"""1-sigma disparity noise of SGBM on projected dots, median over the exam's tuning scenes."""
+"""1-sigma disparity noise of SGBM on projected dots: the median error of `binpick bench --tuning`, 0.156 px, over 0.6745 as for
+a normal distribution, rounded up; one number for all pixels, not calibrated per pixel."""
 AGREEMENT = 12
 """Left and right agree within this, 1/16 px at half resolution: 1.5 px, OpenCV's default, at full resolution."""
 EDGE_RADIUS = 1
-"""Half-resolution pixels around a depth edge that lose confidence: OpenCV's 3 would be 6 at full resolution."""
+"""Half-resolution pixels around a depth edge that lose confidence; OpenCV's own choice cost a tenth of the part pixels here."""
 TEXTURE_PX = 7
 LEAST_CONTRAST = 4
 """Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
