@@ -23,11 +23,12 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """What a shot is exposed with."""
+    """What a shot is exposed with; `pattern` is the place in a programmable projector's sequence, 0: the random dots."""
 
     exposure_us: float
     gain_db: float
     projector: bool
+    pattern: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
