@@ -138,6 +138,6 @@ def test_motorcycle_from_the_command_line(tmp_path):
 
 def test_settings_that_cannot_work_are_refused():
     with pytest.raises(ValueError, match="odd"):
-        settings.StereoSettings(block_px=6)
+        settings.Sgbm(block_px=6)
     with pytest.raises(ValueError, match="larger than p1"):
-        settings.StereoSettings(p1=900)
+        settings.Sgbm(p1=900)

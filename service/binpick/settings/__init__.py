@@ -3,11 +3,12 @@
 from binpick.settings.cell import AravisCameras, CameraAddress, Cell, FileCameras, ModbusSettings, Publish, RestSettings
 from binpick.settings.file import load, parse, schema
 from binpick.settings.job import Job, resolve
-from binpick.settings.recipe import Bin, Limits, PartSize, Pose, Reach, Recipe, SegmentSettings, StereoSettings
+from binpick.settings.recipe import Bin, Limits, PartSize, Pose, Reach, Recipe, SegmentSettings
+from binpick.settings.stereo import PRESETS, Bm, Hybrid, Matcher, Onnx, Sgbm, StereoSettings
 from binpick.settings.tool import Body, Box, Cup, Cylinder, Tool
 
 __all__ = [
-    "AravisCameras", "Bin", "Body", "Box", "CameraAddress", "Cell", "Cup", "Cylinder", "FileCameras", "Job", "Limits",
-    "ModbusSettings", "PartSize", "Pose", "Publish", "Reach", "Recipe", "RestSettings", "SegmentSettings", "StereoSettings",
-    "Tool", "load", "parse", "resolve", "schema",
+    "PRESETS", "AravisCameras", "Bin", "Bm", "Body", "Box", "CameraAddress", "Cell", "Cup", "Cylinder", "FileCameras", "Hybrid",
+    "Job", "Limits", "Matcher", "ModbusSettings", "Onnx", "PartSize", "Pose", "Publish", "Reach", "Recipe", "RestSettings",
+    "SegmentSettings", "Sgbm", "StereoSettings", "Tool", "load", "parse", "resolve", "schema",
 ]

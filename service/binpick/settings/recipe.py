@@ -4,8 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from binpick.data import Light
 from binpick.geometry import Transform
 from binpick.settings.base import Number, Placement, Position, Strict
+from binpick.settings.stereo import PRESETS, Stereo
 
 Length = Annotated[float, Field(ge=0.02, le=3)]
 
@@ -45,37 +47,6 @@ class PartSize(Strict):
     """A segment longer than this may be several parts grown together: the longer, the worse it ranks, metres."""
 
 
-class StereoSettings(Strict):
-    """How disparity is found; the bin gives window and range."""
-
-    block_px: Annotated[int, Field(ge=1, le=11)] = 5
-    """Side of the matched block, odd, px."""
-    p1: Annotated[int, Field(ge=1, le=20000)] = 200
-    """Penalty for a disparity step of 1 px between neighbours."""
-    p2: Annotated[int, Field(ge=2, le=40000)] = 800
-    """Penalty for a larger step; above p1."""
-    uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 5
-    """How much better the best match must be than the second best."""
-    wls_lambda: Annotated[float, Field(ge=1, le=100000)] = 8000.0
-    """Smoothness of the filled map."""
-    wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
-    """How strongly the filled map respects edges of the image."""
-    min_confidence: Annotated[int, Field(ge=0, le=255)] = 128
-    """WLS confidence from which a pixel counts as measured."""
-    edge_px: Annotated[int, Field(ge=0, le=10)] = 2
-    """Pixels next to a depth jump that do not count as measured: a matched block straddles the edge there."""
-    speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
-    """Islands of fewer pixels do not count as measured."""
-
-    @model_validator(mode="after")
-    def _sound(self) -> "StereoSettings":
-        if self.block_px % 2 == 0:
-            raise ValueError("block_px must be odd")
-        if self.p2 <= self.p1:
-            raise ValueError("p2 must be larger than p1")
-        return self
-
-
 class SegmentSettings(Strict):
     """How parts are told apart."""
 
@@ -102,6 +73,19 @@ class Reach(Strict):
         return self
 
 
+class Shot(Strict):
+    """One exposure of a cycle; what is absent is the recipe's own."""
+
+    exposure_us: Annotated[float, Field(ge=20, le=500_000)] | None = None
+    """Exposure time of both cameras, µs."""
+    gain_db: Annotated[float, Field(ge=0, le=24)] | None = None
+    """Gain of both cameras, dB."""
+    projector: bool | None = None
+    """Whether the pattern is on during exposure; a shot without it takes the ambient light's glare out of the others."""
+    pattern: Annotated[int, Field(ge=0, le=63)] = 0
+    """Place in a programmable projector's sequence; 0: the random dots, all that a fixed projector has."""
+
+
 class Limits(Strict):
     """What is never published."""
 
@@ -125,8 +109,8 @@ class Recipe(Strict):
     """The tool to pick with; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
-    stereo: StereoSettings = StereoSettings()
-    """Matching."""
+    stereo: Stereo = PRESETS["quality"]
+    """How disparity is found: `quality`, `fast`, or settings of your own."""
     segment: SegmentSettings = SegmentSettings()
     """Telling parts apart."""
     exposure_us: Annotated[float, Field(ge=20, le=500_000)] = 6000.0
@@ -135,6 +119,8 @@ class Recipe(Strict):
     """Gain of both cameras, dB."""
     projector: bool = True
     """Whether the pattern is on during exposure."""
+    shots: Annotated[tuple[Shot, ...], Field(min_length=1, max_length=64)] = (Shot(),)
+    """What a cycle exposes, one shot after the other; the first is the one shown."""
     limits: Limits = Limits()
     """What is never published."""
     max_grasps: Annotated[int, Field(ge=1, le=20)] = 5
@@ -144,3 +130,21 @@ class Recipe(Strict):
     pose_format: Literal["quaternion_xyzw", "rotvec_rad", "kuka_abc_deg", "fanuc_wpr_deg", "ur_rxryrz_rad"] = (
         "quaternion_xyzw")
     """Orientation on Modbus when the request names none."""
+
+    @model_validator(mode="after")
+    def _measurable(self) -> "Recipe":
+        lights = self.lights
+        if not lights[0].projector and any(light.projector for light in lights):
+            raise ValueError("shots: the first must have the projector on when any has: it is the one shown")
+        if any(light.pattern and not light.projector for light in lights):
+            raise ValueError("shots: a pattern needs the projector")
+        return self
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """What each shot is exposed with, in order."""
+        return tuple(
+            Light(exposure_us=self.exposure_us if shot.exposure_us is None else shot.exposure_us,
+                  gain_db=self.gain_db if shot.gain_db is None else shot.gain_db,
+                  projector=self.projector if shot.projector is None else shot.projector, pattern=shot.pattern)
+            for shot in self.shots)

@@ -1,0 +1,111 @@
+"""How disparity is found: a matcher, what confirms it, and the named presets."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from binpick.settings.base import Strict
+
+
+class Costs(Strict):
+    """What OpenCV's semi-global matcher weighs."""
+
+    block_px: Annotated[int, Field(ge=1, le=11)] = 5
+    """Side of the matched block, odd, px; above 11 OpenCV's result has artefacts."""
+    p1: Annotated[int, Field(ge=1, le=20000)] = 200
+    """Penalty for a disparity step of 1 px between neighbours."""
+    p2: Annotated[int, Field(ge=2, le=40000)] = 800
+    """Penalty for a larger step; above p1."""
+    uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 5
+    """How much better the best match must be than the second best."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "Costs":
+        if self.block_px % 2 == 0:
+            raise ValueError("block_px must be odd")
+        if self.p2 <= self.p1:
+            raise ValueError("p2 must be larger than p1")
+        return self
+
+
+class Sgbm(Costs):
+    """Semi-global matching at full resolution."""
+
+    kind: Literal["sgbm"] = "sgbm"
+    mode: Literal["3way", "sgbm", "hh", "hh4"] = "3way"
+    """Paths the costs run along: 3 (on all cores), 5, 8 or 4 (on one core)."""
+
+
+class Hybrid(Costs):
+    """Semi-global matching on images shrunk by two, refined at full resolution."""
+
+    kind: Literal["hybrid"] = "hybrid"
+
+
+class Bm(Strict):
+    """Block matching: the fastest, and the first to give up where there is little texture."""
+
+    kind: Literal["bm"] = "bm"
+    block_px: Annotated[int, Field(ge=5, le=51)] = 15
+    """Side of the matched block, odd, px."""
+    texture_threshold: Annotated[int, Field(ge=0, le=10000)] = 10
+    """Least sum of gradients in a block that is matched at all."""
+    uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 10
+    """How much better the best match must be than the second best."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "Bm":
+        if self.block_px % 2 == 0:
+            raise ValueError("block_px must be odd")
+        return self
+
+
+class Onnx(Strict):
+    """A stereo network of your own, run on the CPU; needs `pip install binpick[onnx]`."""
+
+    kind: Literal["onnx"] = "onnx"
+    model: Path
+    """The .onnx file: two images in, one disparity map out; see README."""
+
+
+Matcher = Annotated[Sgbm | Hybrid | Bm | Onnx, Field(discriminator="kind")]
+
+
+class StereoSettings(Strict):
+    """How disparity is found; the bin gives window and range."""
+
+    matcher: Matcher = Sgbm()
+    """Which matcher, and its settings."""
+    prefilter: Literal["none", "gaussian", "clahe", "bilateral"] = "none"
+    """What is done to both images before matching: Gaussian blur, local contrast equalisation, or a bilateral filter."""
+    wls_lambda: Annotated[float, Field(ge=1, le=100000)] = 8000.0
+    """Smoothness of the filled map."""
+    wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
+    """How strongly the filled map respects edges of the image."""
+    min_confidence: Annotated[int, Field(ge=0, le=255)] = 128
+    """WLS confidence from which a pixel counts as measured."""
+    edge_px: Annotated[int, Field(ge=0, le=10)] = 2
+    """Pixels next to a depth jump that do not count as measured: a matched block straddles the edge there."""
+    speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
+    """Islands of fewer pixels do not count as measured."""
+
+
+PRESETS = {
+    "quality": StereoSettings(),
+    "fast": StereoSettings(matcher=Hybrid()),
+}
+"""What `stereo: quality` and `--preset` mean; fitted on the exam's tuning seeds."""
+
+
+def _named(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    if value not in PRESETS:
+        raise ValueError(f"there is no preset {value!r}; there are {', '.join(PRESETS)}, or give the settings themselves")
+    return PRESETS[value]
+
+
+PresetName = Literal["quality", "fast"]
+Stereo = Annotated[StereoSettings, BeforeValidator(_named, json_schema_input_type=PresetName | StereoSettings)]
+"""Settings, or the name of a preset."""
