@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 from binpick.data import Light
 from binpick.geometry import Transform
 from binpick.settings.base import Number, Placement, Position, Strict
+from binpick.settings.stereo import PRESETS, Stereo
 
 Length = Annotated[float, Field(ge=0.02, le=3)]
 
@@ -44,37 +45,6 @@ class PartSize(Strict):
     """Faces and parts with less area than half a square of this side are dropped, metres."""
     max_size_m: Annotated[float, Field(ge=0.005, le=2)] = 0.12
     """A segment longer than this may be several parts grown together: the longer, the worse it ranks, metres."""
-
-
-class StereoSettings(Strict):
-    """How disparity is found; the bin gives window and range."""
-
-    block_px: Annotated[int, Field(ge=1, le=11)] = 5
-    """Side of the matched block, odd, px."""
-    p1: Annotated[int, Field(ge=1, le=20000)] = 200
-    """Penalty for a disparity step of 1 px between neighbours."""
-    p2: Annotated[int, Field(ge=2, le=40000)] = 800
-    """Penalty for a larger step; above p1."""
-    uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 5
-    """How much better the best match must be than the second best."""
-    wls_lambda: Annotated[float, Field(ge=1, le=100000)] = 8000.0
-    """Smoothness of the filled map."""
-    wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
-    """How strongly the filled map respects edges of the image."""
-    min_confidence: Annotated[int, Field(ge=0, le=255)] = 128
-    """WLS confidence from which a pixel counts as measured."""
-    edge_px: Annotated[int, Field(ge=0, le=10)] = 2
-    """Pixels next to a depth jump that do not count as measured: a matched block straddles the edge there."""
-    speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
-    """Islands of fewer pixels do not count as measured."""
-
-    @model_validator(mode="after")
-    def _sound(self) -> "StereoSettings":
-        if self.block_px % 2 == 0:
-            raise ValueError("block_px must be odd")
-        if self.p2 <= self.p1:
-            raise ValueError("p2 must be larger than p1")
-        return self
 
 
 class SegmentSettings(Strict):
@@ -139,8 +109,8 @@ class Recipe(Strict):
     """The tool to pick with; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
-    stereo: StereoSettings = StereoSettings()
-    """Matching."""
+    stereo: Stereo = PRESETS["quality"]
+    """How disparity is found: `quality`, `fast`, or settings of your own."""
     segment: SegmentSettings = SegmentSettings()
     """Telling parts apart."""
     exposure_us: Annotated[float, Field(ge=20, le=500_000)] = 6000.0
