@@ -120,14 +120,15 @@ class Rectified:
 class Depth:
     """Disparity of the window's pixels in px, absolute. `measured` gates it: elsewhere `disparity` is NaN.
 
-    `filled` is the smoothed map for people; never a grasp's evidence. `sigma_px` is the 1-sigma noise of a measured pixel.
+    `filled` is the smoothed map for people; never a grasp's evidence. `sigma_px` is each measured pixel's 1-sigma noise,
+    NaN elsewhere.
     """
 
     disparity: Disparity
     filled: Disparity
     confidence: UInt8[np.ndarray, "h w"]
     measured: Mask
-    sigma_px: float
+    sigma_px: Disparity
 
 
 @dataclass(frozen=True, slots=True, eq=False)

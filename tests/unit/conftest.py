@@ -101,7 +101,8 @@ def plant(rig: Rig, job: settings.Job) -> Callable[..., Planted]:
         rectified = Rectified(left=blank, right=blank, window=view, margin=view.num_disparities, focal_px=rect.focal_px,
                               baseline_m=rect.baseline_m, cx_px=rect.cx_px, cy_px=rect.cy_px, T_camera_rect=rect.T_camera_rect)
         values = Depth(disparity=disparity, filled=np.nan_to_num(disparity), measured=measured,
-                       confidence=np.full(depth.shape, 255, dtype=np.uint8), sigma_px=max(noise_px, 0.05))
+                       confidence=np.full(depth.shape, 255, dtype=np.uint8),
+                       sigma_px=np.where(measured, np.float32(max(noise_px, 0.05)), np.float32(np.nan)))
         return Planted(rig, job, values, rectified, T_camera_bin)
 
     return make

@@ -33,7 +33,7 @@ class Surface:
 
 def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surface:
     """The surface of the window at half resolution."""
-    disparity = _half(depth)
+    disparity, sigma_px = _half(depth)
     view = rectified.window
     rows, cols = disparity.shape
     # the centre of half-resolution pixel j lies at full-resolution 2 j + 0.5
@@ -50,19 +50,20 @@ def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surf
     z = np.float32(rectified.focal_px * rectified.baseline_m) / disparity
     rect = cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z])
     T_bin_rect = T_bin_camera @ rectified.T_camera_rect
-    sigma = z * z * np.float32(depth.sigma_px / (rectified.focal_px * rectified.baseline_m))
+    sigma = z * z * sigma_px * np.float32(1 / (rectified.focal_px * rectified.baseline_m))
     return Surface(xyz=geometry.transform(T_bin_rect, rect), normal=geometry.rotate(T_bin_rect, normal), sigma_z_m=sigma)
 
 
-def _half(depth: Depth) -> Float32[np.ndarray, "h w"]:
-    """Mean disparity of each 2x2 block with at least two measured pixels, else NaN."""
+def _half(depth: Depth) -> tuple["Field", "Field"]:
+    """Mean disparity and sigma of each 2x2 block with at least two measured pixels, else NaN."""
     rows, cols = depth.disparity.shape[0] // 2, depth.disparity.shape[1] // 2
     known = depth.measured[:2 * rows, :2 * cols]
-    values = np.where(known, depth.disparity[:2 * rows, :2 * cols], np.float32(0))
-    total = cv2.resize(values, (cols, rows), interpolation=cv2.INTER_AREA)
     weight = cv2.resize(known.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weight >= 0.49, total / weight, np.float32(np.nan)).astype(np.float32)
+    # 0.49: two of four; NaN marks the rest, and passes through every division
+    weight[weight < 0.49] = np.nan
+    values = (np.where(known, field[:2 * rows, :2 * cols], np.float32(0)) for field in (depth.disparity, depth.sigma_px))
+    disparity, sigma_px = (cv2.resize(value, (cols, rows), interpolation=cv2.INTER_AREA) / weight for value in values)
+    return disparity, sigma_px
 
 
 Field = Float32[np.ndarray, "h w"]

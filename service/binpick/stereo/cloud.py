@@ -18,5 +18,5 @@ def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
     np.multiply(z, u[None, :] / np.float32(rectified.focal_px), out=rect[..., 0])
     np.multiply(z, v[:, None] / np.float32(rectified.focal_px), out=rect[..., 1])
     xyz = geometry.transform(rectified.T_camera_rect, rect)
-    sigma_z_m = z * z * np.float32(depth.sigma_px) / depth_scale
+    sigma_z_m = z * z * depth.sigma_px / depth_scale
     return OrganisedCloud(xyz=frozen(xyz), sigma_z_m=frozen(sigma_z_m), window=view)

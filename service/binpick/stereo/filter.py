@@ -44,8 +44,9 @@ def measure(matched: Matched, rectified: Rectified, settings: StereoSettings) ->
     measured = gate(raw, settings) & (confidence >= settings.min_confidence) & _textured(rectified.left[:, margin:])
     disparity = raw.astype(np.float32) / SCALE + rectified.window.min_disparity
     disparity[~measured] = np.nan
+    sigma_px = np.where(measured, np.float32(SGBM_SIGMA_PX), np.float32(np.nan))
     return Depth(disparity=frozen(disparity), filled=frozen(filled + np.float32(rectified.window.min_disparity)),
-                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=SGBM_SIGMA_PX)
+                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(sigma_px))
 
 
 def gate(raw: Int16[np.ndarray, "h w"], settings: StereoSettings) -> Mask:
