@@ -14,6 +14,15 @@ Cloud: TypeAlias = Float32[np.ndarray, "h w 3"]
 Mask: TypeAlias = Bool[np.ndarray, "h w"]
 Labels: TypeAlias = Int32[np.ndarray, "h w"]
 
+# A programmable projector's sequence, by Light.pattern: random dots 0 to 7, then OpenCV's Gray code of a picture this wide and
+# high (structured_light.GrayCodePattern: columns, then rows, each image followed by its inverse), then all white, all black.
+DOT_PATTERNS = 8
+GRAY_CODE_SIZE_PX = (1024, 768)
+GRAY_CODE_IMAGES = 40
+FIRST_GRAY_PATTERN = DOT_PATTERNS
+WHITE_PATTERN = FIRST_GRAY_PATTERN + GRAY_CODE_IMAGES
+BLACK_PATTERN = WHITE_PATTERN + 1
+
 
 def frozen(array: np.ndarray) -> np.ndarray:
     """The same array, read-only from here on: stages hand over values, not workspaces."""
