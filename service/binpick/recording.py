@@ -1,8 +1,9 @@
 """A recording is one folder: what a cycle read and what it answered, enough to compute the same answer again.
 
-    left.png right.png   the raw images, lossless          rig.json   the rig as applied
-    input.json           cycle, request, facts per frame   job.json   recipe, bin and tool as applied
-    result.json          the answer as it was published
+    left.png right.png         the raw images, lossless          rig.json   the rig as applied
+    left-02.png right-02.png   of the second shot, and so on     job.json   recipe, bin and tool as applied
+    input.json                 cycle, request, facts per frame
+    result.json                the answer as it was published
 """
 
 import logging
@@ -28,7 +29,7 @@ from binpick.result import CycleInput, Request, Result, Wire
 from binpick.settings import Job
 
 QUEUE = 2
-"""Cycles that may wait for the disk; a full-resolution one holds 5 MB."""
+"""Cycles that may wait for the disk; a full-resolution one holds 5 MB per shot."""
 PNG_EFFORT = 1
 """Of zlib's 9: four times faster than OpenCV's own choice for a tenth more bytes."""
 
@@ -51,8 +52,19 @@ class FrameFacts(Wire):
     missing: int
 
 
-class InputFile(Wire):
-    """input.json."""
+class PairFacts(Wire):
+    """A pair without its pixels; fields as in `data.StereoPair`."""
+
+    captured_at: str
+    skew_us: float
+    sigma_us: float
+    proof: str
+    left: FrameFacts
+    right: FrameFacts
+
+
+class InputFile(PairFacts):
+    """input.json; its own pair is the first shot."""
 
     format: Literal["binpick-recording"] = "binpick-recording"
     version: Literal[1] = 1
@@ -60,12 +72,8 @@ class InputFile(Wire):
     cycle_id: int
     request: Request
     simulated: bool
-    captured_at: str
-    skew_us: float
-    sigma_us: float
-    proof: str
-    left: FrameFacts
-    right: FrameFacts
+    more: tuple[PairFacts, ...] = ()
+    """The shots after the first, in order."""
 
 
 def folder_name(inputs: CycleInput) -> str:
@@ -98,27 +106,47 @@ def load(folder: Path) -> tuple[CycleInput, Result]:
     """The cycle of a folder. Raises InputError, ImageError, RigError that name the file."""
     facts = _parse(folder / "input.json", InputFile)
     used_rig, _ = rig.load(folder / "rig.json")
-    pair = StereoPair(left=_frame(folder / "left.png", facts.left), right=_frame(folder / "right.png", facts.right),
-                      captured_at=facts.captured_at, skew_us=facts.skew_us, sigma_us=facts.sigma_us, proof=facts.proof)
-    inputs = CycleInput(facts.cycle_id, pair, used_rig, _parse(folder / "job.json", Job), facts.request, facts.simulated)
+    job = _parse(folder / "job.json", Job)
+    if len(job.recipe.shots) != 1 + len(facts.more):
+        raise InputError(f"{folder / 'input.json'}: not a whole recording: {1 + len(facts.more)} shots, but the recipe in "
+                         f"job.json has {len(job.recipe.shots)}")
+    pair, *more = (_pair(folder, number, shot) for number, shot in enumerate((facts, *facts.more), start=1))
+    inputs = CycleInput(facts.cycle_id, pair, used_rig, job, facts.request, facts.simulated, tuple(more))
     return inputs, _parse(folder / "result.json", Result)
 
 
 def _files(inputs: CycleInput, result: Result) -> dict[str, bytes]:
-    pair = inputs.pair
     facts = InputFile(
         made_with={"binpick": __version__, "opencv": cv2.__version__, "numpy": np.__version__, "machine": platform.machine()},
-        cycle_id=inputs.cycle_id, request=inputs.request, simulated=inputs.simulated, captured_at=pair.captured_at,
-        skew_us=pair.skew_us, sigma_us=pair.sigma_us, proof=pair.proof, left=_facts(pair.left), right=_facts(pair.right))
-    return {
-        "left.png": _png(pair.left.image), "right.png": _png(pair.right.image),
-        "input.json": facts.model_dump_json(indent=1).encode(), "rig.json": rig.dump(inputs.rig),
-        "job.json": inputs.job.model_dump_json(indent=1).encode(), "result.json": result.json_bytes(),
+        cycle_id=inputs.cycle_id, request=inputs.request, simulated=inputs.simulated, **dict(_pair_facts(inputs.pair)),
+        more=tuple(map(_pair_facts, inputs.more)))
+    images = {_name(side, number): _png(frame.image) for number, pair in enumerate(inputs.pairs, start=1)
+              for side, frame in (("left", pair.left), ("right", pair.right))}
+    return images | {
+        "input.json": facts.model_dump_json(indent=1, exclude=None if inputs.more else {"more"}).encode(),
+        "rig.json": rig.dump(inputs.rig), "job.json": inputs.job.model_dump_json(indent=1).encode(),
+        "result.json": result.json_bytes(),
     }
+
+
+def _name(side: str, number: int) -> str:
+    """The image of a shot, counted from 1."""
+    return f"{side}.png" if number == 1 else f"{side}-{number:02d}.png"
+
+
+def _pair_facts(pair: StereoPair) -> PairFacts:
+    return PairFacts(captured_at=pair.captured_at, skew_us=pair.skew_us, sigma_us=pair.sigma_us, proof=pair.proof,
+                     left=_facts(pair.left), right=_facts(pair.right))
 
 
 def _facts(frame: Frame) -> FrameFacts:
     return FrameFacts(**{name: getattr(frame, name) for name in FrameFacts.model_fields})
+
+
+def _pair(folder: Path, number: int, facts: PairFacts) -> StereoPair:
+    return StereoPair(left=_frame(folder / _name("left", number), facts.left),
+                      right=_frame(folder / _name("right", number), facts.right),
+                      captured_at=facts.captured_at, skew_us=facts.skew_us, sigma_us=facts.sigma_us, proof=facts.proof)
 
 
 def _frame(path: Path, facts: FrameFacts) -> Frame:

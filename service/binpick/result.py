@@ -1,7 +1,6 @@
 """What a cycle reads, what it answers (schema binpick-result/1), and the snapshot that every interface shows.
 
-A `Result` is made once per cycle and serialised once to bytes; REST sends those bytes, the registers are filled from the same
-object. Lengths are metres, angles radians, times milliseconds where the name says so.
+A `Result` is serialised once to bytes; REST sends those, the registers are filled from the same object. Metres, radians.
 """
 
 import math
@@ -220,7 +219,10 @@ def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleInput:
-    """Everything that one cycle reads; stored together with its result it is a recording."""
+    """Everything that one cycle reads; stored together with its result it is a recording.
+
+    `pair` is the recipe's first shot, `more` are the others in order; `job.recipe.lights` says what each was exposed with.
+    """
 
     cycle_id: int
     pair: StereoPair
@@ -228,21 +230,23 @@ class CycleInput:
     job: Job
     request: Request
     simulated: bool = False
+    more: tuple[StereoPair, ...] = ()
+
+    @property
+    def pairs(self) -> tuple[StereoPair, ...]:
+        """All shots in order."""
+        return (self.pair, *self.more)
 
     @property
     def T_base_camera(self) -> Transform | None:
-        """Maps camera coordinates to the robot's base: a fixed rig's own, or through the flange sent with the request.
-
-        None without a hand-eye calibration, or without a flange pose where the rig needs one.
-        """
+        """Maps camera coordinates to the robot's base: a fixed rig's own, or through the request's flange; else None."""
         if self.rig.T_base_rig is not None:
             return np.array(self.rig.T_base_rig)
         flange = self.request.T_base_flange
         if self.rig.T_flange_rig is None or flange is None:
             return None
         T_base_flange = geometry.from_quaternion(np.array(flange.position_m), np.array(flange.quaternion_xyzw))
-        T_base_rig: Transform = T_base_flange @ np.array(self.rig.T_flange_rig)
-        return T_base_rig
+        return np.asarray(T_base_flange @ np.array(self.rig.T_flange_rig))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,10 +262,7 @@ class CycleResult:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A finished cycle as it is published: the object, its bytes, and when (monotonic ns) its images were triggered.
-
-    Without images it is when the cycle ended.
-    """
+    """A finished cycle as published: the object, its bytes, and when (monotonic ns) it was triggered; without images, ended."""
 
     result: Result
     body: bytes
@@ -280,9 +281,8 @@ class Artefact:
 class Snapshot:
     """Everything the interfaces may show, at one instant; replaced whole, never changed.
 
-    `current` is the cycle in flight (0: none);
-    `published` is the result that holds until it is acknowledged, withdrawn, too old, or replaced: `valid` says whether it
-    does, `withdrawn` why not. `latest` is the last finished cycle whatever became of it.
+    `current` is the cycle in flight (0: none); `published` is the result that holds until it is acknowledged, withdrawn, too
+    old, or replaced: `valid` says whether it does, `withdrawn` why not. `latest` is the last finished cycle in any case.
     """
 
     boot_id: int

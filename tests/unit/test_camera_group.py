@@ -116,16 +116,16 @@ def test_light_is_set_when_it_changes_and_after_opening() -> None:
     left, right = Odd(0), Odd(1)
     group = grouped(left, right)
     brighter = replace(LIGHT, exposure_us=200.0)
-    for light in (LIGHT, replace(LIGHT), brighter, brighter):
+    for light in (LIGHT, replace(LIGHT), replace(LIGHT, pattern=2), brighter, brighter):
         group.capture(light, within(2))
-    assert [light.exposure_us for light in left.lights] == [100.0, 200.0]
+    assert [(light.exposure_us, light.pattern) for light in left.lights] == [(100.0, 0), (100.0, 2), (200.0, 0)]
     right.fail = "dead"
     with pytest.raises(CameraLost):
         group.capture(brighter, within(2))
     right.fail = ""
     group.open(within(1))
     group.capture(brighter, within(2))
-    assert [light.exposure_us for light in left.lights] == [100.0, 200.0, 200.0]
+    assert [light.exposure_us for light in left.lights] == [100.0, 100.0, 200.0, 200.0]
     assert (left.opened, right.opened) == (1, 2)
 
 

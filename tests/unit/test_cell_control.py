@@ -63,6 +63,7 @@ class TestCameras:
     broken: str = ""
     opened: bool = False
     stale: bool = False
+    stale_from: int = 1
     captures: list[Light] = field(default_factory=list)
     attempts: int = 0
     closed: int = 0
@@ -76,7 +77,7 @@ class TestCameras:
 
     def capture(self, light: Light, deadline_ns: int) -> StereoPair:
         self.captures.append(light)
-        triggered_ns = 1 if self.stale else time.monotonic_ns()
+        triggered_ns = 1 if self.stale and len(self.captures) >= self.stale_from else time.monotonic_ns()
         self.gate.wait()
         if self.broken:
             self.opened = False
@@ -292,6 +293,62 @@ def test_a_pair_older_than_the_cycle_is_never_computed() -> None:
             assert shown.published is not None
             code = shown.published.result.return_code
             assert (code.code, code.message) == (Code.CAMERAS, "the cameras gave a pair that is older than the trigger")
+
+    asyncio.run(scenario())
+
+
+SHOTS = Recipe(frame="camera", shots=({}, {"exposure_us": 1200.0}, {"projector": False}))  # type: ignore[arg-type]
+
+
+def test_all_shots_are_taken_in_order_before_the_images_count_as_acquired() -> None:
+    async def scenario() -> None:
+        cameras, seen = TestCameras(), []
+
+        def run(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+            seen.append(inputs)
+            return good(inputs, proceed)
+
+        async with living(cameras, run, recipes=[SHOTS]) as cell:
+            cell.start(Request(), "rest")
+            await asyncio.sleep(0.05)
+            assert not cell.snapshot().acquired
+            cameras.gate.set()
+            shown = await until(cell, lambda s: s.valid)
+            (inputs,) = seen
+            assert [(light.exposure_us, light.projector) for light in cameras.captures] == [
+                (6000.0, True), (1200.0, True), (6000.0, False)]
+            assert [pair.left.exposure_us for pair in inputs.pairs] == [6000.0, 1200.0, 6000.0]
+            assert shown.published is not None
+            assert shown.published.triggered_ns == inputs.pair.left.triggered_ns
+
+    asyncio.run(scenario())
+
+
+def test_a_later_shot_that_is_stale_fails_the_cycle() -> None:
+    async def scenario() -> None:
+        cameras = released()
+        cameras.stale, cameras.stale_from = True, 3
+        async with living(cameras, recipes=[SHOTS]) as cell:
+            cell.start(Request(), "rest")
+            shown = await until(cell, lambda s: s.valid)
+            assert shown.published is not None
+            assert shown.published.result.return_code.code is Code.CAMERAS
+            assert len(cameras.captures) == 3
+
+    asyncio.run(scenario())
+
+
+def test_a_cycle_withdrawn_between_two_shots_takes_no_more() -> None:
+    async def scenario() -> None:
+        cameras = TestCameras()
+        async with living(cameras, recipes=[SHOTS]) as cell:
+            cycle_id = cell.start(Request(), "rest")
+            while not cameras.captures:
+                await asyncio.sleep(0.005)
+            cell.abort(cycle_id, "rest")
+            cameras.gate.set()
+            await until(cell, lambda s: s.phase == "ready")
+            assert len(cameras.captures) == 1
 
     asyncio.run(scenario())
 

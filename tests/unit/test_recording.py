@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from binpick.recording import Recorder
 from binpick.result import CycleInput, Request, failure
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
+from binpick.settings.recipe import Shot
 
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 K = ((170.0, 0.0, 96.3), (0.0, 170.0, 60.1), (0.0, 0.0, 1.0))
@@ -58,8 +59,9 @@ def test_what_comes_back_is_what_went_in(tmp_path: Path) -> None:
                 assert getattr(before, field.name) == getattr(after, field.name), field.name
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == [
         "input.json", "job.json", "left.png", "result.json", "rig.json", "right.png"]
-    assert set(json.loads((tmp_path / "one" / "input.json").read_text())["made_with"]) == {
-        "binpick", "opencv", "numpy", "machine"}
+    facts = json.loads((tmp_path / "one" / "input.json").read_text())
+    assert set(facts["made_with"]) == {"binpick", "opencv", "numpy", "machine"}
+    assert "more" not in facts            # as before there were shots
 
 
 def test_a_recording_computes_to_the_same_bytes(tmp_path: Path) -> None:
@@ -67,6 +69,45 @@ def test_a_recording_computes_to_the_same_bytes(tmp_path: Path) -> None:
     recording.save(tmp_path / "one", inputs(), live)
     got, stored = recording.load(tmp_path / "one")
     assert pipeline.run(got).result.timeless_bytes() == live.timeless_bytes() == stored.timeless_bytes()
+
+
+def three_shots() -> CycleInput:
+    """The second with the projector off, the third of another pattern; each with facts of its own."""
+    given = inputs()
+    shots = (Shot(), Shot(projector=False), Shot(exposure_us=1200.0, pattern=2))
+    job = given.job.model_copy(update={"recipe": given.job.recipe.model_copy(update={"shots": shots})})
+    more = tuple(replace(inputs(seed=seed).pair, skew_us=float(seed), captured_at=f"2026-01-02T03:04:0{seed}.000Z")
+                 for seed in (2, 3))
+    return replace(given, job=job, more=more)
+
+
+def test_every_shot_of_a_cycle_is_kept_and_computes_to_the_same_bytes(tmp_path: Path) -> None:
+    given = three_shots()
+    live = pipeline.run(given).result
+    recording.save(tmp_path / "one", given, live)
+    assert sorted(path.name for path in (tmp_path / "one").glob("*.png")) == [
+        "left-02.png", "left-03.png", "left.png", "right-02.png", "right-03.png", "right.png"]
+    got, _ = recording.load(tmp_path / "one")
+    assert len(got.pairs) == len(given.pairs) == 3
+    for before, after in zip(given.pairs, got.pairs, strict=True):
+        assert np.array_equal(before.left.image, after.left.image)
+        assert np.array_equal(before.right.image, after.right.image)
+        assert (before.skew_us, before.captured_at) == (after.skew_us, after.captured_at)
+    assert pipeline.run(got).result.timeless_bytes() == live.timeless_bytes()
+
+
+@pytest.mark.parametrize(("name", "error"), [("right-03.png", ImageError), ("left-02.png", ImageError)])
+def test_a_missing_shot_is_named(tmp_path: Path, name: str, error: type[InputError]) -> None:
+    recording.save(tmp_path / "one", three_shots(), failure(12, Request(), Code.NO_DEPTH))
+    (tmp_path / "one" / name).unlink()
+    with pytest.raises(error, match=name):
+        recording.load(tmp_path / "one")
+
+
+def test_as_many_shots_as_the_recipe_says(tmp_path: Path) -> None:
+    recording.save(tmp_path / "one", replace(three_shots(), more=()), failure(12, Request(), Code.NO_DEPTH))
+    with pytest.raises(InputError, match=r"1 shots, but the recipe in job\.json has 3"):
+        recording.load(tmp_path / "one")
 
 
 def test_a_folder_is_never_overwritten_and_never_half_there(tmp_path: Path) -> None:

@@ -33,6 +33,12 @@ def test_only_a_bin_is_required():
     (BIN + "cameras: {backend: files, left: l.png, right: r.png, max_skew_us: 5}\n", "max_skew_us: unknown key"),
     (BIN + "recipes: [{tools: [1, 1]}]\n", "recipes.0.tools: .*at most 1"),
     (BIN + "recipes: [{limits: {reach: {min_m: [0, 0, 0], max_m: [1, 1, -1]}}}]\n", "min_m must be below max_m"),
+    (BIN + "recipes: [{shots: []}]\n", "recipes.0.shots: .*at least 1"),
+    (BIN + "recipes: [{shots: [{exposure_us: 5}]}]\n", "recipes.0.shots.0.exposure_us: .*20"),
+    (BIN + "recipes: [{shots: [{pattern: 64}]}]\n", "recipes.0.shots.0.pattern"),
+    (BIN + "recipes: [{shots: [{projector: false}, {}]}]\n", "the first must have the projector on"),
+    (BIN + "recipes: [{projector: false, shots: [{pattern: 1}]}]\n", "a pattern needs the projector"),
+    (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{shots: [{}, {}]}]\n", "are one shot, not 2"),
     (BIN + "gripper: {cups: [{x_m: 0.01}]}\n", "tools.0.cups.0.x_m: .*less than or equal to 0"),
     (BIN + "gripper: {wrist: {symmetry: 2}}\n", "wrist: unknown key"),
     (BIN.replace("[0, 0, 1]", "[0, 0, 1], rotvec_rad: [0, 0, 0], kuka_abc_deg: [0, 0, 0]"), "exactly one orientation"),
@@ -41,6 +47,19 @@ def test_only_a_bin_is_required():
 def test_an_error_says_where_and_what(text, says):
     with pytest.raises(SettingsError, match=says):
         settings.parse(text, "cell.yaml")
+
+
+def test_a_shot_is_exposed_as_the_recipe_says_unless_it_says_otherwise():
+    shots = "[{}, {exposure_us: 900}, {projector: false}, {gain_db: 0, pattern: 2}]"
+    text = f"recipes: [{{exposure_us: 5000, gain_db: 3, shots: {shots}}}]"
+    lights = settings.resolve(settings.parse(BIN + text, "cell.yaml")).recipe.lights
+    assert [(light.exposure_us, light.gain_db, light.projector, light.pattern) for light in lights] == [
+        (5000.0, 3.0, True, 0), (900.0, 3.0, True, 0), (5000.0, 3.0, False, 0), (5000.0, 0.0, True, 2)]
+
+
+def test_without_shots_a_recipe_is_one_shot_of_its_own_light():
+    (light,) = settings.resolve(settings.parse(BIN + "recipes: [{exposure_us: 5000, projector: false}]", "c")).recipe.lights
+    assert (light.exposure_us, light.gain_db, light.projector, light.pattern) == (5000.0, 0.0, False, 0)
 
 
 def test_an_error_in_a_list_is_reported_once():

@@ -36,7 +36,7 @@ class CameraGroup:
         self._open = [False, False]
         self._errors = ["", ""]
         self._due: list[MonotonicNs | None] = [None, None]
-        self._light: tuple[float, float, bool] | None = None
+        self._light: tuple[float, float, bool, int] | None = None
         self._sequence = 0
 
     def open(self, deadline_ns: MonotonicNs) -> None:
@@ -109,7 +109,7 @@ class CameraGroup:
             raise CameraError(self._errors[index] or f"camera {camera.name} is not open", camera.name)
 
     def _configure(self, light: Light) -> None:
-        wanted = (light.exposure_us, light.gain_db, light.projector)
+        wanted = (light.exposure_us, light.gain_db, light.projector, light.pattern)
         if wanted != self._light:
             self._each(lambda _, camera: camera.configure(light, self._clock() + COMMAND_NS))
             self._light = wanted

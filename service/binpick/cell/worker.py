@@ -130,14 +130,16 @@ class Worker:
             self.recorder.offer(inputs, result)
 
     def _acquire(self, ticket: Ticket) -> CycleInput:
-        recipe = ticket.job.recipe
-        self._proceed(ticket)
-        pair = self.cameras.capture(Light(recipe.exposure_us, recipe.gain_db, recipe.projector), ticket.deadline_ns)
-        if _triggered_ns(pair) < ticket.started_ns:
-            raise PairRefused("the cameras gave a pair that is older than the trigger")
+        """All shots of the recipe, one after the other; they are accepted together, after the last."""
+        pairs: list[StereoPair] = []
+        for light in ticket.job.recipe.lights:
+            self._proceed(ticket)
+            pairs.append(self.cameras.capture(light, ticket.deadline_ns))
+            if _triggered_ns(pairs[-1]) < ticket.started_ns:
+                raise PairRefused("the cameras gave a pair that is older than the trigger")
         simulated = any(status.simulated for status in self.cameras.statuses())
         self.board.step(machine.acquired, ticket.cycle_id)
-        return CycleInput(ticket.cycle_id, pair, self.rig, ticket.job, ticket.request, simulated)
+        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]))
 
     def _compute(self, ticket: Ticket, inputs: CycleInput) -> Result:
         """The pipeline's result with the cell's own times; its arrays go to the gallery while the id still counts."""

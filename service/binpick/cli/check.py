@@ -136,12 +136,9 @@ def _open(cell: "Cell", cameras: "Cameras") -> str:
 
 
 def _capture(cell: "Cell", rig: "Rig", cameras: "Cameras") -> str:
-    from binpick.data import Light
     from binpick.errors import ImageError
 
-    recipe = cell.recipes[0]
-    pair = cameras.capture(Light(recipe.exposure_us, recipe.gain_db, recipe.projector),
-                           time.monotonic_ns() + int(CAMERA_LIMIT_S * 1e9))
+    pair = cameras.capture(cell.recipes[0].lights[0], time.monotonic_ns() + int(CAMERA_LIMIT_S * 1e9))
     width, height = rig.image_size_px
     for frame in (pair.left, pair.right):
         if frame.image.shape != (height, width):

@@ -9,7 +9,7 @@ import typer
 if TYPE_CHECKING:
     from binpick.result import CycleInput, CycleResult, PoseMessage, Request
     from binpick.rig import Rig
-    from binpick.settings import Cell
+    from binpick.settings import Cell, Job, Recipe
 
 PICTURES = ("cloud.ply", "overlay.png")
 
@@ -74,7 +74,6 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
     from binpick import recording, settings
     from binpick.camera import backends
     from binpick.camera.group import CameraGroup
-    from binpick.data import Light
     from binpick.result import CycleInput
 
     job = settings.resolve(cell, request.recipe)
@@ -82,17 +81,28 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         typer.echo(f"{left.parent} is a recording: its cycle and request are used", err=True)
         recorded, _ = recording.load(left.parent)
         job = settings.resolve(cell, request.recipe or recorded.request.recipe, recorded.request.bin, recorded.request.tool)
+        if recorded.more or len(job.recipe.shots) > 1:
+            job = _exposed(job, recorded.job.recipe)
         flange = request.T_base_flange or recorded.request.T_base_flange
         return replace(recorded, rig=rig, job=job, request=recorded.request.model_copy(update={"T_base_flange": flange}))
+    if len(job.recipe.shots) > 1:
+        typer.echo(f"two images are one shot: the other {len(job.recipe.shots) - 1} of the recipe are left out", err=True)
+        job = _exposed(job, job.recipe.model_copy(update={"shots": job.recipe.shots[:1]}))
     files = settings.FileCameras(backend="files", left=left, right=right)
     cameras = CameraGroup(backends.make(files), files.max_skew_us)
     deadline_ns = time.monotonic_ns() + 10_000_000_000
     cameras.open(deadline_ns)
     try:
-        pair = cameras.capture(Light(job.recipe.exposure_us, job.recipe.gain_db, job.recipe.projector), deadline_ns)
+        pair = cameras.capture(job.recipe.lights[0], deadline_ns)
     finally:
         cameras.close()
     return CycleInput(cycle_id=1, pair=pair, rig=rig, job=job, request=request, simulated=False)
+
+
+def _exposed(job: "Job", taken: "Recipe") -> "Job":
+    """The job with the shots that the images really are: those of the recipe they were taken by."""
+    light = {name: getattr(taken, name) for name in ("exposure_us", "gain_db", "projector", "shots")}
+    return job.model_copy(update={"recipe": job.recipe.model_copy(update=light)})
 
 
 def write(folder: Path, files: dict[str, bytes]) -> None:

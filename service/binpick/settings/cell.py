@@ -146,6 +146,8 @@ class Cell(Strict):
                 raise ValueError(f"recipe {recipe.number}: there is no bin {recipe.bin}")
             if missing := set(recipe.tools) - tools:
                 raise ValueError(f"recipe {recipe.number}: there is no tool {sorted(missing)}")
+            if len(recipe.shots) > 1 and self.cameras.backend == "files":
+                raise ValueError(f"recipe {recipe.number}: two images from disk are one shot, not {len(recipe.shots)}")
         if self.control == "modbus" and self.publish.modbus is None:
             raise ValueError("control is modbus, but publish.modbus is null")
         return self
