@@ -34,7 +34,7 @@ def depth(
     from binpick import artefacts
     from binpick.errors import InputError
     from binpick.settings import StereoSettings
-    from binpick.stereo import cloud, filter, match
+    from binpick.stereo import cloud, filter, match, rectify
 
     if rectified == (rig is not None):
         raise InputError("give either --rectified (with --min-disparity and --num-disparities) or --rig rig.json")
@@ -42,7 +42,8 @@ def depth(
         raise InputError(f"--near {near:g} must be smaller than --far {far:g}")
     images = _read(left), _read(right)
     began = time.perf_counter()
-    pair = _with_rig(*images, rig, near, far) if rig is not None else _rectified(*images, min_disparity, num_disparities)
+    pair = (_with_rig(*images, rig, near, far) if rig is not None
+            else rectify.whole(*images, min_disparity, num_disparities))
     times = {"rectify": time.perf_counter()}
     matched = match.match(pair, StereoSettings())
     times["match"] = time.perf_counter()
@@ -65,25 +66,6 @@ def _read(path: Path) -> "Image":
     if image is None:
         raise ImageError(f"{path}: {'not an image that can be read' if path.is_file() else 'there is no such image'}")
     return image
-
-
-def _rectified(left: "Image", right: "Image", min_disparity: int, num_disparities: int) -> "Rectified":
-    """The whole images as a window; the left margin is the border repeated, which matches nothing."""
-    import cv2
-    import numpy as np
-
-    from binpick.data import Rectified, Window
-    from binpick.errors import ImageError
-
-    if left.shape != right.shape:
-        raise ImageError(f"the left image is {left.shape[1]}x{left.shape[0]} px, the right {right.shape[1]}x{right.shape[0]}")
-    rows, cols = left.shape
-    wanted = 16 * ((num_disparities + 15) // 16)
-    view = Window(0, 0, cols, rows, min_disparity, wanted)
-    padded = [cv2.copyMakeBorder(image, 0, 0, wanted + shift, 0, cv2.BORDER_REPLICATE)[:, :cols + wanted]
-              for image, shift in ((left, 0), (right, min_disparity))]
-    return Rectified(left=padded[0], right=padded[1], window=view, margin=wanted, focal_px=1.0, baseline_m=1.0, cx_px=0.0,
-                     cy_px=0.0, T_camera_rect=np.eye(4))
 
 
 def _with_rig(left: "Image", right: "Image", rig: Path, near: float, far: float) -> "Rectified":

@@ -105,6 +105,23 @@ def rectify(left: Image, right: Image, rig: Rig, view: Window) -> Rectified:
                      baseline_m=rect.baseline_m, cx_px=rect.cx_px, cy_px=rect.cy_px, T_camera_rect=rect.T_camera_rect)
 
 
+def whole(left: Image, right: Image, min_disparity: int, num_disparities: int) -> Rectified:
+    """Images that are rectified already, whole; their left margin is the border repeated, which matches nothing.
+
+    `num_disparities` is rounded up to the 16 that OpenCV wants. Nothing is known of the cameras:
+    focal length and baseline are 1. Raises ImageError on images of two sizes.
+    """
+    if left.shape != right.shape:
+        raise ImageError(f"the left image is {left.shape[1]}x{left.shape[0]} px, the right {right.shape[1]}x{right.shape[0]}")
+    rows, cols = left.shape
+    wanted = 16 * ((num_disparities + 15) // 16)
+    view = Window(0, 0, cols, rows, min_disparity, wanted)
+    padded = [frozen(cv2.copyMakeBorder(image, 0, 0, wanted + shift, 0, cv2.BORDER_REPLICATE)[:, :cols + wanted])
+              for image, shift in ((left, 0), (right, min_disparity))]
+    return Rectified(left=padded[0], right=padded[1], window=view, margin=wanted, focal_px=1.0, baseline_m=1.0, cx_px=0.0,
+                     cy_px=0.0, T_camera_rect=np.eye(4))
+
+
 Map = tuple[Int16[np.ndarray, "h w 2"], UInt16[np.ndarray, "h w"]]
 
 
