@@ -15,8 +15,8 @@ class Costs(Strict):
     """Side of the matched block, odd, px; above 11 OpenCV's result has artefacts."""
     p1: Annotated[int, Field(ge=1, le=20000)] = 200
     """Penalty for a disparity step of 1 px between neighbours."""
-    p2: Annotated[int, Field(ge=2, le=40000)] = 800
-    """Penalty for a larger step; above p1."""
+    p2: Annotated[int, Field(ge=2, le=20000)] = 800
+    """Penalty for a larger step; above p1. Near 32767 OpenCV's 16-bit sums overflow, and every pixel is wrong."""
     uniqueness_percent: Annotated[int, Field(ge=0, le=50)] = 5
     """How much better the best match must be than the second best."""
 
@@ -66,7 +66,7 @@ class Onnx(Strict):
 
     kind: Literal["onnx"] = "onnx"
     model: Path
-    """The .onnx file: two images in, one disparity map out; see README."""
+    """The .onnx file: two float32 images [1, 1 or 3, H, W] in, grey levels 0 to 255, left first; one disparity map out, px."""
 
 
 Matcher = Annotated[Sgbm | Hybrid | Bm | Onnx, Field(discriminator="kind")]

@@ -1,0 +1,164 @@
+"""The raw search: one function from a pair to a view's disparity, whichever the matcher."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int16, UInt8
+
+from binpick.data import Disparity, Image
+from binpick.errors import ImageError, InputError
+from binpick.settings.stereo import Bm, Hybrid, Matcher, Onnx, Sgbm
+from binpick.stereo import network
+
+SCALE = 16
+"""OpenCV's disparities are integers in 1/16 px."""
+STEP = 16
+"""OpenCV searches multiples of this many disparities: StereoBM refuses others, StereoSGBM's documentation forbids them."""
+MOST_DISPARITIES = 2032
+"""The largest multiple of STEP whose disparities fit OpenCV's int16 in 1/16 px; beyond 2047 px they wrap to negative ones."""
+PREFILTER_CAP = 31
+"""Where SGBM clips gradients; also StereoBM's default, which its right matcher has whatever the left one's is."""
+MOST_BYTES = 2 << 30
+"""What a cost volume may take; the modes hh and hh4 hold all of it, the others a few rows."""
+BYTES_PER_COST = 4
+"""Measured on OpenCV 4.14: 231 MB for 888x600 px and 112 disparities: a cost and a sum, 16 bits each."""
+MODES = {
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
+    "hh": cv2.STEREO_SGBM_MODE_HH,
+    "hh4": cv2.STEREO_SGBM_MODE_HH4,
+}
+Half = UInt8[np.ndarray, "half_h half_w"]
+
+
+def search(left: Image, right: Image, num_disparities: int, matcher: Matcher) -> Disparity:
+    """The left view's disparity, px, as found: NaN where nothing was, no other judgement yet.
+
+    Both images share rows and a left margin of num_disparities columns, and `right` is already shifted by the smallest
+    disparity (`data.Rectified`), so that what is found lies in [0, num_disparities) and never near the end of OpenCV's int16.
+    The result has the images' shape; its margin means nothing. StereoBM measures nothing within half a block of the images'
+    borders. All but networks drop what differs by more than 1 px (hybrid: 2 px) on the way back from the right.
+    Raises ImageError on a window too small for the block, InputError on a range or a model that cannot be used.
+    """
+    _check(left, num_disparities, matcher)
+    if isinstance(matcher, Onnx):
+        return _seen(network.disparity(left, right, matcher.model), num_disparities)
+    if isinstance(matcher, Hybrid):
+        halves = _halves(left, right, num_disparities)
+        return _double(_left_pass(*halves, _engine(matcher, _half(num_disparities))), left.shape, num_disparities)
+    return _left_pass(left, right, _engine(matcher, num_disparities))
+
+
+def search_right(left: Image, right: Image, num_disparities: int, matcher: Matcher) -> Disparity:
+    """The right view's disparity on the right view's grid, px, positive; NaN where nothing was found.
+
+    A right pixel x shows what the left view has at x + disparity. OpenCV's right matcher searches -num_disparities + 1 to 0
+    and so returns *negated* disparities (as its WLS filter wants them, opencv_contrib#2974), -16 * num_disparities where it
+    found none; it has neither uniqueness nor left-right check, and it gives up the last num_disparities columns, so both
+    images are padded there, and a match in the padding is none. A network sees the pair mirrored. Raises as `search`.
+    """
+    _check(left, num_disparities, matcher)
+    if isinstance(matcher, Onnx):
+        mirrored = network.disparity(_mirror(right), _mirror(left), matcher.model)
+        return np.ascontiguousarray(_seen(mirrored, num_disparities)[:, ::-1])
+    if isinstance(matcher, Hybrid):
+        halves = _halves(left, right, num_disparities)
+        return _double(_right_pass(*halves, _engine(matcher, _half(num_disparities))), left.shape, num_disparities)
+    return _right_pass(left, right, _engine(matcher, num_disparities))
+
+
+def _engine(matcher: Sgbm | Hybrid | Bm, num_disparities: int) -> cv2.StereoMatcher:
+    if isinstance(matcher, Bm):
+        engine = cv2.StereoBM.create(num_disparities, matcher.block_px)
+        engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
+        engine.setPreFilterCap(PREFILTER_CAP)
+        engine.setTextureThreshold(matcher.texture_threshold)
+        engine.setUniquenessRatio(matcher.uniqueness_percent)
+        engine.setDisp12MaxDiff(1)
+        return engine
+    return cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=num_disparities, blockSize=matcher.block_px, P1=matcher.p1, P2=matcher.p2,
+        disp12MaxDiff=1, preFilterCap=PREFILTER_CAP, uniquenessRatio=matcher.uniqueness_percent, speckleWindowSize=0,
+        speckleRange=0, mode=MODES[matcher.mode if isinstance(matcher, Sgbm) else "3way"])
+
+
+def _left_pass(left: Image, right: Image, engine: cv2.StereoMatcher) -> Disparity:
+    return _pixels(np.asarray(engine.compute(left, right), dtype=np.int16), engine.getNumDisparities())
+
+
+def _right_pass(left: Image, right: Image, engine: cv2.StereoMatcher) -> Disparity:
+    num_disparities = engine.getNumDisparities()
+    padded = [cv2.copyMakeBorder(image, 0, 0, 0, num_disparities, cv2.BORDER_REPLICATE) for image in (right, left)]
+    raw = np.asarray(cv2.ximgproc.createRightMatcher(engine).compute(*padded), dtype=np.int16)
+    found = _pixels(-raw[:, :left.shape[1]], num_disparities)
+    reach = np.arange(left.shape[1] - 1, -1, -1, dtype=np.float32)
+    found[found > reach] = np.nan
+    return found
+
+
+def _pixels(raw: Int16[np.ndarray, "h w"], num_disparities: int) -> Disparity:
+    """1/16 px to px; OpenCV's mark for nothing found is one disparity outside the range, at either end."""
+    found = raw.astype(np.float32) * np.float32(1 / SCALE)
+    found[(raw < 0) | (raw >= SCALE * num_disparities)] = np.nan
+    return found
+
+
+def _seen(found: Disparity, num_disparities: int) -> Disparity:
+    """Nothing outside the range, and nothing that would have been seen outside of the other image."""
+    reach = np.arange(found.shape[1], dtype=np.float32)
+    with np.errstate(invalid="ignore"):
+        inside = (found >= 0) & (found < num_disparities) & (found <= reach)
+    return np.where(inside, found, np.float32(np.nan))
+
+
+def _half(num_disparities: int) -> int:
+    """Disparities of the pair shrunk by two, in whole steps again."""
+    return STEP * ((num_disparities + 2 * STEP - 1) // (2 * STEP))
+
+
+def _padding(num_disparities: int) -> int:
+    """Columns by which the margin of the shrunk pair is wider, at full resolution: 0 or 16."""
+    return 2 * _half(num_disparities) - num_disparities
+
+
+def _halves(left: Image, right: Image, num_disparities: int) -> tuple[Half, Half]:
+    """Both images shrunk by two.
+
+    Odd sides are padded to even ones, or OpenCV would shrink by a little more than two and stretch every disparity; the
+    padding on the left makes the margin as wide as the coarse range, which is rounded up to whole steps.
+    """
+    rows, cols = left.shape
+    even = [cv2.copyMakeBorder(image, 0, rows % 2, _padding(num_disparities), cols % 2, cv2.BORDER_REPLICATE)
+            for image in (left, right)]
+    size = even[0].shape[1] // 2, even[0].shape[0] // 2
+    coarse = [np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in even]
+    return coarse[0], coarse[1]
+
+
+def _double(coarse: Float32[np.ndarray, "half_h half_w"], shape: tuple[int, int], num_disparities: int) -> Disparity:
+    """Twice the disparity of the coarse pixel that covers each pixel: no value in between invents a surface across a jump."""
+    (rows, cols), (height, width), pad = coarse.shape, shape, _padding(num_disparities)
+    fine = cv2.resize(2 * coarse, (2 * cols, 2 * rows), interpolation=cv2.INTER_NEAREST)
+    fine = np.array(fine[:height, pad:pad + width], dtype=np.float32, order="C")
+    fine[fine >= num_disparities] = np.nan
+    return fine
+
+
+def _mirror(image: Image) -> Image:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _check(left: Image, num_disparities: int, matcher: Matcher) -> None:
+    """What OpenCV would answer with rubbish instead of an error (each case is a test)."""
+    if num_disparities < STEP or num_disparities % STEP or num_disparities > MOST_DISPARITIES:
+        raise InputError(f"{num_disparities} disparities cannot be searched: it must be a multiple of {STEP} up to "
+                         f"{MOST_DISPARITIES}; bring the nearest distance further away")
+    if isinstance(matcher, Onnx):
+        return
+    rows, cols = left.shape
+    least = matcher.block_px * (2 if isinstance(matcher, Hybrid) else 1)
+    if cols - num_disparities <= least or rows < least:
+        raise ImageError(f"a window of {cols - num_disparities}x{rows} px is too small for a matched block of "
+                         f"{least} px: use a smaller block_px or a larger window")
+    needed = BYTES_PER_COST * rows * cols * num_disparities
+    if isinstance(matcher, Sgbm) and matcher.mode in ("hh", "hh4") and needed > MOST_BYTES:
+        raise InputError(f"mode {matcher.mode} would need {needed / 2**30:.1f} GiB here: use mode 3way or sgbm")
