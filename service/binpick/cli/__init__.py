@@ -15,7 +15,7 @@ from binpick.cli.schema import schema
 from binpick.cli.sim import sim
 from binpick.errors import BinpickError
 
-COMMANDS: tuple[Callable[..., Any], ...] = (
+COMMANDS: tuple[Callable[..., Any] | typer.Typer, ...] = (
     demo,
     run,
     check,
@@ -30,7 +30,10 @@ COMMANDS: tuple[Callable[..., Any], ...] = (
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Bin-picking perception for two GigE cameras on a CPU.")
 for command in COMMANDS:
-    app.command()(command)
+    if isinstance(command, typer.Typer):
+        app.add_typer(command)
+    else:
+        app.command()(command)
 
 
 def main() -> None:

@@ -1,11 +1,32 @@
-"""`binpick bench`: accuracy and speed on the frozen exam, beside the textbook pipeline on the same frames."""
+"""`binpick bench`: accuracy and speed on the frozen exam, beside textbook methods on the same frames."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+
+from binpick.cli.pick import write
+
+if TYPE_CHECKING:
+    from binpick.lab.depths import Sheet
 
 
-def bench(
+class Parts(TyperGroup):
+    """The parts of the bench; without a part's name the whole exam is meant."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Puts `exam` before options of its own."""
+        named = args[:1] in (["--help"], *([name] for name in self.commands))
+        return super().parse_args(ctx, args if named else ["exam", *args])
+
+
+bench = typer.Typer(name="bench", cls=Parts,
+                    help="Measure accuracy and speed; without a part's name, as in `binpick bench --scenes 3`: exam.")
+
+
+@bench.command()
+def exam(
     world: Annotated[str, typer.Option(help="Exam world: A (6 mm lens, 600x400 mm bin) or B (12 mm lens, 300x200 mm).")] = "A",
     scenes: Annotated[int, typer.Option(help="How many of the ten report seeds, 101 to 110.", min=1, max=10)] = 10,
     cycles: Annotated[int, typer.Option(help="Timed cycles per scene.", min=1, max=100)] = 2,
@@ -24,9 +45,9 @@ def bench(
     from rich.progress import track
 
     from binpick.lab import grasps, report
-    from binpick.sim import exam
+    from binpick.sim import exam as frozen
 
-    seeds = (exam.TUNING_SEEDS if tuning else exam.REPORT_SEEDS)[:scenes]
+    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
     sitting = grasps.sit(world, seeds, cycles, textbook)
     done = list(track(sitting, "Sitting the exam", total=len(seeds), console=Console(stderr=True), transient=True))
     run = report.figures(world, done)
@@ -34,6 +55,46 @@ def bench(
         typer.echo(json.dumps(run, indent=1))
     else:
         Console(width=150).print(report.table(run))
+
+
+@bench.command()
+def stereo(
+    world: Annotated[str, typer.Option(help="A (mixed, metal, projector off), B (mixed), or all.")] = "all",
+    scenes: Annotated[int, typer.Option(help="How many of the seeds from 101, or with --tuning from 1.", min=1, max=10)] = 5,
+    tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
+    repeats: Annotated[int, typer.Option(help="Timed runs per scene of ours and of plain SGBM.", min=1, max=100)] = 5,
+    middlebury: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder with Middlebury's 2014 scenes.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for a picture per scene.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Depth alone: ours beside plain SGBM, SGBM + WLS, block matching and the classics, on the same frames."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from binpick.errors import InputError
+    from binpick.lab import plates, sitting, tables
+    from binpick.lab.depths import SERIES
+    from binpick.sim import exam as frozen
+
+    chosen = [series for series in SERIES if world in (series.world, "all")]
+    if not chosen:
+        raise InputError(f"--world {world}: there are A, B and all")
+    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("Measuring depth", total=len(chosen) * len(seeds))
+
+        def marked(sheet: "Sheet") -> None:
+            if out:
+                write(out, plates.png(sheet))
+            progress.advance(task)
+
+        run = sitting.run(chosen, seeds, repeats, middlebury, marked)
+    if as_json:
+        typer.echo(json.dumps(run, indent=1))
+    else:
+        Console(width=150).print(tables.tables(run))
 
 
 def _latency(address: str, seconds: float = 20.0) -> dict[str, int | float]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int16
 
 from binpick.data import Rectified
 
@@ -22,28 +22,36 @@ class DepthScore:
     pixels: int
 
 
-def plain_sgbm(rectified: Rectified) -> Field:
-    """Disparity of the yardstick every table is read against: SGBM 3-way, left pass only; NaN = not matched."""
-    matcher = cv2.StereoSGBM.create(
-        0, rectified.window.num_disparities, 5, 200, 800, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_SGBM_3WAY
-    )
-    raw = matcher.compute(rectified.left, rectified.right)[:, rectified.margin :]
+def plain_matcher(num_disparities: int, mode: int = cv2.STEREO_SGBM_MODE_SGBM_3WAY) -> cv2.StereoSGBM:
+    """The yardstick that every table is read against."""
+    return cv2.StereoSGBM.create(0, num_disparities, 5, 200, 800, 1, 0, 10, 100, 2, mode)
+
+
+def absolute(raw: Int16[np.ndarray, "h2 w2"], rectified: Rectified) -> Field:
+    """OpenCV's disparities of a rectified pair as ours: without the margin, in px, NaN = not matched."""
+    raw = raw[:, rectified.margin :]
     disparity: Field = raw.astype(np.float32) / 16 + np.float32(rectified.window.min_disparity)
     disparity[raw < 0] = np.nan
     return disparity
 
 
+def plain_sgbm(rectified: Rectified) -> Field:
+    """Disparity of the yardstick: SGBM 3-way, left pass only; NaN = not matched."""
+    raw = plain_matcher(rectified.window.num_disparities).compute(rectified.left, rectified.right)
+    return absolute(np.asarray(raw, dtype=np.int16), rectified)
+
+
 def score(
     disparity: Field, truth: Field, on_part: Bool[np.ndarray, "h w"], visible_both: Bool[np.ndarray, "h w"]
 ) -> DepthScore:
-    """Scores a disparity map (NaN = not measured) on the pixels of parts."""
+    """Scores a disparity map (NaN = not measured) on the pixels of parts; where none is measured, shares and median are NaN."""
     judged = on_part & np.isfinite(truth)
     error = np.abs(disparity - truth)[judged & np.isfinite(disparity)]
     seen = judged & visible_both
     return DepthScore(
-        bad1=float((error > 1).mean()),
-        bad2=float((error > 2).mean()),
-        median_px=float(np.median(error)),
+        bad1=float((error > 1).mean()) if error.size else float("nan"),
+        bad2=float((error > 2).mean()) if error.size else float("nan"),
+        median_px=float(np.median(error)) if error.size else float("nan"),
         density=float(np.isfinite(disparity)[seen].mean()),
         pixels=int(seen.sum()),
     )
