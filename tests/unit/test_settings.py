@@ -35,7 +35,8 @@ def test_only_a_bin_is_required():
     (BIN + "recipes: [{limits: {reach: {min_m: [0, 0, 0], max_m: [1, 1, -1]}}}]\n", "min_m must be below max_m"),
     (BIN + "recipes: [{shots: []}]\n", "recipes.0.shots: .*at least 1"),
     (BIN + "recipes: [{shots: [{exposure_us: 5}]}]\n", "recipes.0.shots.0.exposure_us: .*20"),
-    (BIN + "recipes: [{shots: [{pattern: 64}]}]\n", "recipes.0.shots.0.pattern"),
+    (BIN + "recipes: [{shots: [{pattern: 50}]}]\n", "recipes.0.shots.0.pattern"),
+    (BIN + "recipes: [{shots: [{pattern: 8}, {pattern: 9}]}]\n", "the Gray code is the patterns 8 to 49, each once"),
     (BIN + "recipes: [{shots: [{projector: false}, {}]}]\n", "the first must have the projector on"),
     (BIN + "recipes: [{projector: false, shots: [{pattern: 1}]}]\n", "a pattern needs the projector"),
     (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{shots: [{}, {}]}]\n", "are one shot, not 2"),
@@ -55,6 +56,12 @@ def test_a_shot_is_exposed_as_the_recipe_says_unless_it_says_otherwise():
     lights = settings.resolve(settings.parse(BIN + text, "cell.yaml")).recipe.lights
     assert [(light.exposure_us, light.gain_db, light.projector, light.pattern) for light in lights] == [
         (5000.0, 3.0, True, 0), (900.0, 3.0, True, 0), (5000.0, 3.0, False, 0), (5000.0, 0.0, True, 2)]
+
+
+def test_a_gray_code_recipe_lists_the_whole_sequence():
+    shots = [{"pattern": pattern} for pattern in range(8, 50)]
+    cell = settings.parse(BIN + f"recipes: [{{shots: {shots}}}]", "cell.yaml")
+    assert [light.pattern for light in cell.recipes[0].lights] == list(range(8, 50))
 
 
 def test_without_shots_a_recipe_is_one_shot_of_its_own_light():

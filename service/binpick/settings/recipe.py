@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from binpick.data import Light
+from binpick.data import BLACK_PATTERN, FIRST_GRAY_PATTERN, Light
 from binpick.geometry import Transform
 from binpick.settings.base import Number, Placement, Position, Strict
 from binpick.settings.stereo import PRESETS, Stereo
@@ -82,8 +82,8 @@ class Shot(Strict):
     """Gain of both cameras, dB."""
     projector: bool | None = None
     """Whether the pattern is on during exposure; a shot without it takes the ambient light's glare out of the others."""
-    pattern: Annotated[int, Field(ge=0, le=63)] = 0
-    """Place in a programmable projector's sequence; 0: the random dots, all that a fixed projector has."""
+    pattern: Annotated[int, Field(ge=0, le=BLACK_PATTERN)] = 0
+    """What a programmable projector shows: random dots 0 to 7, then a Gray code, of which a recipe has all shots or none."""
 
 
 class Limits(Strict):
@@ -138,6 +138,9 @@ class Recipe(Strict):
             raise ValueError("shots: the first must have the projector on when any has: it is the one shown")
         if any(light.pattern and not light.projector for light in lights):
             raise ValueError("shots: a pattern needs the projector")
+        code = sorted(light.pattern for light in lights if light.pattern >= FIRST_GRAY_PATTERN)
+        if code and code != list(range(FIRST_GRAY_PATTERN, BLACK_PATTERN + 1)):
+            raise ValueError(f"shots: the Gray code is the patterns {FIRST_GRAY_PATTERN} to {BLACK_PATTERN}, each once")
         return self
 
     @property

@@ -1,0 +1,197 @@
+"""Several shots of one scene become what is matched: exposures merged, ambient light taken out, patterns side by side."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from binpick.data import DOT_PATTERNS, Depth, Disparity, Image, Light, Mask, Rectified, frozen
+
+Linear = Float32[np.ndarray, "h w"]
+SAFE, SATURATED = 200, 250
+"""Grey levels: to the first a pixel counts fully, from the second on not at all; rectifying mixes 255 with its neighbours."""
+BLOB_PX = 7
+"""A pixel is blind when most of this square around it is saturated; single saturated dots are as good as others."""
+DISAGREEMENT_PX, SIGMAS = 1.0, 3.0
+"""Patterns disagree when their disparities differ by more than both."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shots:
+    """What the matcher gets: one pair per dot pattern, at least one.
+
+    `guide` is the left image without the pattern, on the pairs' grid, where such a shot was taken. `blind` are the window's
+    pixels that are saturated in every shot with dots, or in every one without, `blind_right` the right images', on their grid.
+    """
+
+    pairs: tuple[Rectified, ...]
+    guide: UInt8[np.ndarray, "h grid"] | None
+    blind: Mask
+    blind_right: Bool[np.ndarray, "h grid"]
+
+    @property
+    def matched(self) -> Rectified:
+        """The first pattern's pair."""
+        return self.pairs[0]
+
+    def glare(self, disparity: Disparity) -> Mask:
+        """The matches (absolute disparity, px, NaN: none) that are blind in one view only: what shines is not on the surface.
+
+        What is saturated in both views is held by its rim and errs less than other pixels (measured on the exam's steel).
+        """
+        if not self.blind.any() and not self.blind_right.any():
+            return self.blind
+        first = self.matched.margin + self.matched.window.min_disparity
+        own = np.arange(first, first + disparity.shape[1], dtype=np.float32)
+        place = np.nan_to_num(own - disparity).round().astype(np.intp).clip(0, self.blind_right.shape[1] - 1)
+        one_sided: Mask = (np.take_along_axis(self.blind_right, place, axis=1) ^ self.blind) & np.isfinite(disparity)
+        return frozen(one_sided)
+
+
+def combine(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> Shots:
+    """What to match of a cycle's shots; `lights` says what each was exposed with. Gray-code shots are left to `graycode`.
+
+    Shots of one pattern that differ in exposure become one image (the longest exposure that is not saturated, brought to one
+    scale, its square root taken so that dark contrast survives 8 bits). Shots without the projector are subtracted from those
+    with it, and guide the filter; without any of the latter they are themselves matched. Both cameras are treated alike.
+    Raises ValueError when there is nothing to match.
+    """
+    taken = list(zip(shots, lights, strict=True))
+    patterns: dict[int, list[tuple[Rectified, Light]]] = {}
+    for rectified, light in taken:
+        if light.projector and light.pattern < DOT_PATTERNS:
+            patterns.setdefault(light.pattern, []).append((rectified, light))
+    plain = [(rectified, light) for rectified, light in taken if not light.projector]
+    if not patterns:
+        patterns, plain = {0: plain}, []
+    if not patterns[min(patterns)]:
+        raise ValueError("no shot to match: neither dots nor plain light")
+    dots, ambient = [_view(group) for group in patterns.values()], _view(plain) if plain else None
+    base = taken[0][0]
+    pairs = tuple(replace(base, left=left, right=right) for left, right in (_pair(view, ambient) for view in dots))
+    blind, blind_right = (_blind([view.saturated(side) for view in dots], ambient.saturated(side) if ambient else None)
+                          for side in (0, 1))
+    guide = ambient.compressed(0) if ambient else None
+    return Shots(pairs, guide, frozen(np.ascontiguousarray(blind[:, base.margin:])), blind_right)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """Shots of one light that differ in exposure (µs, gain included) at most."""
+
+    left: tuple[Image, ...]
+    right: tuple[Image, ...]
+    exposures: tuple[float, ...]
+
+    @property
+    def longest(self) -> float:
+        return max(self.exposures)
+
+    @property
+    def top(self) -> float:
+        """The brightest that can be told apart, in grey levels of the longest exposure."""
+        return 255 * self.longest / min(self.exposures)
+
+    def side(self, index: int) -> tuple[Image, ...]:
+        return (self.left, self.right)[index]
+
+    def linear(self, index: int) -> Linear:
+        """Grey levels as the longest exposure would give them without an end of its scale."""
+        order = sorted(range(len(self.exposures)), key=lambda k: -self.exposures[k])
+        images = self.side(index)
+        left_over = np.ones(images[0].shape, np.float32)
+        total = np.zeros(images[0].shape, np.float32)
+        for k in order:
+            image = images[k]
+            scaled = image * np.float32(self.longest / self.exposures[k])
+            weight = left_over if k == order[-1] else left_over * _trust(image)
+            total += weight * scaled
+            left_over = left_over - weight
+        return total
+
+    def saturated(self, index: int) -> Mask:
+        """In every exposure: the shortest decides."""
+        shortest = min(range(len(self.exposures)), key=lambda k: self.exposures[k])
+        return np.asarray(self.side(index)[shortest] >= SATURATED)
+
+    def compressed(self, index: int) -> Image:
+        """As it was when there is only one exposure."""
+        images = self.side(index)
+        return images[0] if len(images) == 1 else _compressed(self.linear(index), self.top)
+
+
+def _view(group: list[tuple[Rectified, Light]]) -> _View:
+    return _View(tuple(rectified.left for rectified, _ in group), tuple(rectified.right for rectified, _ in group),
+                 tuple(light.exposure_us * float(10 ** (light.gain_db / 20)) for _, light in group))
+
+
+def _pair(dots: _View, ambient: _View | None) -> tuple[Image, Image]:
+    if ambient is None:
+        return dots.compressed(0), dots.compressed(1)
+    scale = np.float32(dots.longest / ambient.longest)
+    left, right = (_compressed(cv2.max(dots.linear(side) - ambient.linear(side) * scale, 0.0), dots.top) for side in (0, 1))
+    return left, right
+
+
+def _compressed(linear: Linear, top: float) -> Image:
+    """8 bits; a scale that is longer than that by its square root."""
+    if top > 256:         # equal exposures may differ by rounding
+        linear = cv2.sqrt(linear * np.float32(255 / top * 255))
+    image: Image = np.asarray(cv2.convertScaleAbs(linear), np.uint8)
+    return frozen(image)
+
+
+def _trust(image: Image) -> Linear:
+    """1 where nothing near is bright, 0 where something near is saturated."""
+    peak = cv2.dilate(image, np.ones((3, 3), np.uint8))
+    levels = np.clip((SATURATED - np.arange(256, dtype=np.float32)) / (SATURATED - SAFE), 0, 1)
+    return np.asarray(cv2.LUT(peak, levels.astype(np.float32)), np.float32)
+
+
+def _blind(dots: list[Mask], ambient: Mask | None) -> Mask:
+    """Blobs that are saturated under every pattern, or by the plain light already."""
+    everywhere = np.logical_and.reduce(dots)
+    if ambient is not None:
+        everywhere = everywhere | ambient
+    if not everywhere.any():
+        return frozen(everywhere)
+    return frozen(np.asarray(cv2.medianBlur(everywhere.astype(np.uint8), BLOB_PX) > 0))
+
+
+def fuse(depths: tuple[Depth, ...]) -> Depth:
+    """The depth on which all patterns agree; the map for people is their mean, the confidence that of the least sure."""
+    if len(depths) == 1:
+        return depths[0]
+    disparity, sigma_px = agree(tuple(depth.disparity for depth in depths), tuple(depth.sigma_px for depth in depths))
+    filled = np.asarray(np.mean([depth.filled for depth in depths], axis=0, dtype=np.float32))
+    confidence = np.minimum.reduce([depth.confidence for depth in depths])
+    return Depth(disparity=disparity, filled=frozen(filled), confidence=frozen(confidence),
+                 measured=frozen(np.isfinite(disparity)), sigma_px=sigma_px)
+
+
+def agree(disparities: tuple[Disparity, ...], sigmas: tuple[Disparity, ...]) -> tuple[Disparity, Disparity]:
+    """One disparity and its sigma of several measurements of one view (px, NaN: not measured), weighted by 1/sigma².
+
+    A pixel is kept where all of them measured it, with a spread within 1 px or 3 sigma of a difference of the least certain.
+    """
+    if len(disparities) == 1:
+        return disparities[0], sigmas[0]
+    shape = disparities[0].shape
+    weights, total = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    low, high = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+    widest, everywhere = np.zeros(shape, np.float32), np.ones(shape, bool)
+    for disparity, sigma in zip(disparities, sigmas, strict=True):
+        measured = np.isfinite(disparity)
+        weight = np.where(measured, 1 / sigma**2, 0).astype(np.float32)
+        weights += weight
+        total += weight * np.where(measured, disparity, 0)
+        low, high = np.fmin(low, disparity), np.fmax(high, disparity)
+        widest = np.fmax(widest, sigma)
+        everywhere &= measured
+    limit = np.maximum(np.float32(DISAGREEMENT_PX), np.float32(SIGMAS * np.sqrt(2)) * widest)
+    kept = everywhere & ~(high - low > limit)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean, sigma = total / weights, 1 / np.sqrt(weights)
+    nan = np.float32(np.nan)
+    return frozen(np.where(kept, mean, nan)), frozen(np.where(kept, sigma, nan))
