@@ -50,6 +50,16 @@ def test_a_triggered_frame_comes_when_its_exposure_has_elapsed(camera, time):
     assert (frame.exposure_us, frame.gain_db) == (20_000.0, 3.0)
 
 
+def test_it_exposes_under_the_light_it_was_configured_with(time):
+    lights = []
+    camera = SimCamera(0, lambda index, light, shot: lights.append(light) or np.zeros((1, 1), np.uint8), time.clock, time.sleep)
+    camera.open(time.now + SECOND)
+    camera.configure(Light(100.0, 0.0, True, 12), time.now + SECOND)
+    camera.trigger(1, time.now + SECOND)
+    camera.grab(1, time.now + SECOND)
+    assert [light.pattern for light in lights] == [12]
+
+
 def test_its_status_says_that_it_is_simulated(camera, time):
     status = camera.status()
     assert status.simulated

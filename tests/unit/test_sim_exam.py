@@ -52,6 +52,15 @@ def test_mixed_means_equal_shares():
     assert set(Counter(exam.kinds("mixed", 25)).values()) == {5}
     assert exam.kinds("bolt", 2) == ("bolt", "bolt")
     assert exam.kinds("block+tee", 3) == ("block", "tee", "block")
+    assert exam.kinds("bolt+steel-bolt", 2) == ("bolt", "steel-bolt")
+
+
+def test_metal_means_the_same_shapes_of_steel():
+    mixed, metal = (exam.kinds(mixture, 25) for mixture in ("mixed", "metal"))
+    assert not set(mixed) & set(metal)
+    assert [exam.KINDS[kind].pieces for kind in mixed] == [exam.KINDS[kind].pieces for kind in metal]
+    assert all(exam.KINDS[kind].mirror > 0 for kind in metal)
+    assert not any(exam.KINDS[kind].mirror for kind in mixed)
 
 
 def test_unknown_names_say_what_there_is():

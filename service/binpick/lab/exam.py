@@ -8,6 +8,8 @@ import numpy as np
 from binpick import settings
 from binpick.data import Frame, Light, StereoPair, Window
 from binpick.result import CycleInput, Request
+from binpick.settings import Recipe
+from binpick.settings.recipe import Shot
 from binpick.sim import exam
 from binpick.sim.render import Renderer
 from binpick.sim.truth import Truth, truth
@@ -40,14 +42,27 @@ def renderer(world: str) -> Renderer:
     return Renderer(exam.rig(world), world)
 
 
-def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin") -> Paper:
-    """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame."""
+def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin",
+          projector: bool | None = None, shots: tuple[Shot, ...] = ()) -> Paper:
+    """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame.
+
+    `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own.
+    """
     scene = World(world, kinds, parts, seed).scene()
     job = settings.resolve(exam.cell(world), recipe)
-    light = Light(job.recipe.exposure_us, job.recipe.gain_db, job.recipe.projector)
-    frames = [
+    changes = ({} if projector is None else {"projector": projector}) | ({"shots": shots} if shots else {})
+    if changes:
+        job = job.model_copy(update={"recipe": Recipe.model_validate(job.recipe.model_dump() | changes)})
+    first, *more = (pair(scene, light, seed + i) for i, light in enumerate(job.recipe.lights))
+    request = Request.model_validate({"frame": frame})
+    return Paper(CycleInput(1, first, exam.rig(world), job, request, simulated=True, more=tuple(more)), scene)
+
+
+def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:
+    """What both cameras take of a scene; another shot number has other noise. Raises InputError for an unknown pattern."""
+    left, right = (
         Frame(
-            image=renderer(world).expose(scene, index, light, seed),
+            image=renderer(scene.world).expose(scene, index, light, shot),
             camera=name,
             sequence=1,
             frame_id=1,
@@ -58,12 +73,8 @@ def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recip
             gain_db=light.gain_db,
         )
         for index, name in enumerate(("left", "right"))
-    ]
-    pair = StereoPair(
-        left=frames[0], right=frames[1], captured_at="2026-01-01T00:00:00Z", skew_us=0.0, sigma_us=0.0, proof="simulated"
     )
-    request = Request.model_validate({"frame": frame})
-    return Paper(CycleInput(1, pair, exam.rig(world), job, request, simulated=True), scene)
+    return StereoPair(left=left, right=right, captured_at="2026-01-01T00:00:00Z", skew_us=0.0, sigma_us=0.0, proof="simulated")
 
 
 def wilson(good: int, of: int) -> tuple[float, float]:

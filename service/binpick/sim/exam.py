@@ -1,4 +1,4 @@
-"""The frozen exam: two set-ups, five kinds of part, one table of optics, and the seeds to tune and to report on."""
+"""The frozen exam: two set-ups, five shapes of part in plastic and steel, one table of optics, seeds to tune and report on."""
 
 import hashlib
 import json
@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from binpick import geometry
+from binpick import data, geometry
 from binpick.errors import InputError
 from binpick.geometry import Transform
 from binpick.rig import Rig, RigCamera
@@ -70,11 +70,15 @@ class Primitive:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of part: its pieces (they may overlap), diffuse reflectance 0 to 1, and strength of its gloss."""
+    """A kind of part: its pieces (they may overlap), diffuse reflectance 0 to 1, and strength of its gloss.
+
+    `mirror` is what bare metal reflects of its surroundings when looked at squarely, 0 to 1.
+    """
 
     pieces: tuple[Primitive, ...]
     reflectance: float
     gloss: float
+    mirror: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +87,8 @@ class Optics:
 
     Noise as of a small-pixel CMOS sensor with some analogue gain (16 electrons a step of 8 bits, and 2 steps of its own).
     Blur, noise and contrast were set on the tuning seeds so that plain SGBM errs on world A's parts as it does on
-    path-traced renderings of such bins: bad-1 4 to 7 %, bad-2 2 to 4 %, median 0.17 to 0.25 px.
+    path-traced renderings of such bins: bad-1 4 to 7 %, bad-2 2 to 4 %, median 0.17 to 0.25 px. Steel's were set so that
+    about half of plain SGBM's pixels on it are beyond 1 px, as measured on such renderings of dark shiny metal.
     """
 
     ambient: float = 0.16
@@ -109,6 +114,10 @@ class Optics:
     read_noise_steps: float = 2.0
     black_level: float = 2.0
     steps_per_us: float = 0.060
+    metal_gloss: float = 6.0
+    metal_gloss_power: int = 256
+    metal_roughness_rad: float = 0.008
+    surround: float = 0.16
 
 
 SETUPS = {
@@ -140,6 +149,11 @@ KINDS = {
                   Primitive("hexagon", (19.0, 19.0, 7.5), (0.0, 0.0, 25.0))), 0.42, 0.30),
 }
 
+STEEL_REFLECTANCE, STEEL_MIRROR = 0.03, 0.60
+MIXTURES = {"mixed": tuple(KINDS), "metal": tuple(f"steel-{shape}" for shape in KINDS)}
+KINDS |= {steel: Kind(KINDS[shape].pieces, STEEL_REFLECTANCE, 0.0, STEEL_MIRROR)
+          for shape, steel in zip(MIXTURES["mixed"], MIXTURES["metal"], strict=True)}
+
 OPTICS = Optics()
 
 
@@ -151,10 +165,10 @@ def setup(name: str) -> Setup:
 
 
 def kinds(mixture: str, count: int) -> tuple[str, ...]:
-    """The kinds of `count` parts in equal shares: of one kind, of some as "block+tee", or "mixed" of all. Raises InputError."""
-    chosen = list(KINDS) if mixture == "mixed" else mixture.split("+")
+    """The kinds of `count` parts in equal shares: of one kind, of some as "block+tee", or of a mixture. Raises InputError."""
+    chosen = MIXTURES.get(mixture) or tuple(mixture.split("+"))
     if unknown := [kind for kind in chosen if kind not in KINDS]:
-        raise InputError(f"there is no kind of part {unknown[0]!r}; there are mixed, {', '.join(KINDS)}")
+        raise InputError(f"there is no kind of part {unknown[0]!r}; there are {', '.join([*MIXTURES, *KINDS])}")
     return tuple(chosen[i % len(chosen)] for i in range(count))
 
 
@@ -202,5 +216,6 @@ def sha256() -> str:
     tables = {
         "setups": {k: asdict(v) for k, v in SETUPS.items()}, "kinds": {k: asdict(v) for k, v in KINDS.items()},
         "optics": asdict(OPTICS), "image": IMAGE_SIZE_PX, "tuning": TUNING_SEEDS, "report": REPORT_SEEDS,
+        "mixtures": MIXTURES, "patterns": (data.DOT_PATTERNS, data.GRAY_CODE_SIZE_PX),
     }
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()

@@ -16,6 +16,8 @@ BIN_ID, TABLE_ID = 0, -1
 # facets of 3.75°: a Ø24 cylinder then stays within 0.01 mm of round
 CYLINDER_SIDES = 96
 TABLE_M = 4.0
+# a hit this near a cylinder's side is on it: more than its facets' error, less than what stands out of it
+ROUND_WITHIN_M = 2e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,23 @@ class Caster:
         """Whether something stands on each ray between `start` and `end` ray lengths."""
         answer: Bool[np.ndarray, "n"] = self._scene.test_occlusions(_tensor(rays), tnear=start, tfar=end).numpy()
         return answer
+
+
+def rounded(scene: WorldScene, points: Float32[np.ndarray, "n 3"], hits: Hits) -> Float32[np.ndarray, "n 3"]:
+    """The normals that hit points of parts have on a true cylinder, where a facet of one was hit: what a mirror needs."""
+    normals = hits.normal.copy()
+    for part in scene.parts:
+        for piece in (p for p in exam.KINDS[part.kind].pieces if p.shape == "cylinder"):
+            mine = np.flatnonzero(hits.part_id == part.part_id)
+            T_part_bin = geometry.inverse(part.T_bin_part)
+            radial = geometry.transform(T_part_bin, points[mine]) - np.array(piece.at_mm, np.float32) / 1000
+            length, radial[:, 2] = np.abs(radial[:, 2]), 0
+            radius = np.linalg.norm(radial, axis=1)
+            along = np.abs(geometry.rotate(T_part_bin, hits.normal[mine])[:, 2])
+            on_side = ((np.abs(radius - piece.size_mm[0] / 2000) < ROUND_WITHIN_M) & (along < 0.5)
+                       & (length < piece.size_mm[2] / 2000 + ROUND_WITHIN_M))
+            normals[mine[on_side]] = geometry.rotate(part.T_bin_part, radial[on_side] / radius[on_side, None])
+    return normals
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """What the cameras see: rays through distorted pixels, shaded once per change of the world; a shot adds exposure and noise."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,14 +12,17 @@ from binpick.data import Image, Light
 from binpick.rig import Rig
 from binpick.sim import exam
 from binpick.sim.mesh import TABLE_ID, Caster, Hits, Rays, part_mesh
+from binpick.sim.mirror import Mirrored, mirrored
 from binpick.sim.projector import Projector
-from binpick.sim.surface import Shading, materials, radiance, shade
+from binpick.sim.surface import Lit, Shading, ends, materials, radiance, shade
 from binpick.sim.world import WorldScene
 
 Radiance = Float32[np.ndarray, "h w"]
 Pixels = Int[np.ndarray, "n"]
 # pictures kept: two cameras, pattern on and off, this world and the last
 KEPT = 8
+# worlds under every light kept: of two cameras
+LIT_KEPT = 2
 # parts that stand out of the bin are drawn up to this height above the rim, metres
 ABOVE_RIM_M = 0.02
 NOISE_SEED = 90210
@@ -31,14 +34,24 @@ UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 8, 1e-6)
 class View:
     """One camera over the empty bin: its whole picture, and the rays and shading of the crop where anything can change.
 
-    Rays are in frame `bin`, directions of length 1. `empty` holds the whole picture without and with the pattern.
+    Rays are in frame `bin`, directions of length 1, and change from pixel to pixel, right and down, by about `pixel_steps`.
+    `empty` holds the whole picture without (None) and with the pattern 0.
     """
 
     vignette: Radiance
-    empty: tuple[Radiance, Radiance]
+    empty: dict[int | None, Radiance]
     crop: tuple[slice, slice]
     rays: Rays
+    pixel_steps: Float32[np.ndarray, "2 3"]
     background: Shading
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A crop of one world from one camera, for any picture of the projector; None: nothing in it is of metal."""
+
+    lit: Lit
+    metal: Mirrored | None
 
 
 class Renderer:
@@ -49,14 +62,17 @@ class Renderer:
         self._projector = Projector(world, optics)
         self._lock = threading.Lock()
         self._views: dict[int, View] = {}
-        self._kept: dict[tuple[str, int, bool], Radiance] = {}
+        self._kept: dict[tuple[str, int, int | None], Radiance] = {}
+        self._seen: dict[tuple[str, int], Seen] = {}
+        self._surrounds: dict[int, Lit] = {}
         self._caster: tuple[str, Caster] | None = None
 
     def expose(self, scene: WorldScene, camera_index: int, light: Light, shot: int) -> Image:
-        """The 8-bit image of one shot; the same scene, light and shot number give the same image."""
+        """The 8-bit image of one shot; the same scene, light and shot number give the same image. Raises InputError."""
         o = self._optics
         gain = np.float32(10 ** (light.gain_db / 20))
-        steps = self.radiance(scene, camera_index, light.projector) * (gain * np.float32(light.exposure_us * o.steps_per_us))
+        pattern = light.pattern if light.projector else None
+        steps = self.radiance(scene, camera_index, pattern) * (gain * np.float32(light.exposure_us * o.steps_per_us))
         rng = np.random.Generator(np.random.SFC64((NOISE_SEED, scene.seed, camera_index, shot)))
         noise = rng.standard_normal(steps.shape, dtype=np.float32)
         # the variance of n electrons is n: in steps², steps * gain / electrons_per_step
@@ -67,8 +83,11 @@ class Renderer:
         image: Image = cv2.convertScaleAbs(cv2.max(steps, -o.black_level), beta=o.black_level)
         return image
 
-    def radiance(self, scene: WorldScene, camera_index: int, pattern: bool) -> Radiance:
-        """The picture without exposure and noise, blurred and vignetted; read-only, kept for the next shot."""
+    def radiance(self, scene: WorldScene, camera_index: int, pattern: int | None) -> Radiance:
+        """The picture without exposure and noise, blurred and vignetted; read-only, kept for the next shot.
+
+        `pattern` as `Light.pattern`; None: the projector is off. Raises InputError when the projector has no such pattern.
+        """
         if scene.world != self._world:
             raise ValueError(f"this renderer looks into world {self._world}, not {scene.world}")
         key = (scene.digest, camera_index, pattern)
@@ -79,36 +98,57 @@ class Renderer:
                 self._kept[key] = self._draw(scene, camera_index, pattern)
             return self._kept[key]
 
-    def _draw(self, scene: WorldScene, index: int, pattern: bool) -> Radiance:
+    def _draw(self, scene: WorldScene, index: int, pattern: int | None) -> Radiance:
         if index not in self._views:
             self._views[index] = self._view(index)
-        view, caster = self._views[index], self._cast(scene)
+        view = self._views[index]
         rows, columns = view.crop
         shape = (rows.stop - rows.start, columns.stop - columns.start)
-        shading = self._with_parts(view, scene, caster, self._silhouettes(scene, index, view.crop))
-        full = view.empty[pattern].copy()
-        full[view.crop] = radiance(shading, shape, scene, caster, pattern, self._optics)
+        seen = self._look(view, scene, index)
+        full = view.empty[pattern].copy() if pattern in view.empty else self._surround(index, pattern)
+        crop = radiance(seen.lit, shape, self._projector, pattern, self._optics)
+        if seen.metal:
+            crop.reshape(-1)[seen.metal.pixels] += seen.metal.radiance(self._projector, pattern)
+        full[view.crop] = crop
         picture: Radiance = cv2.GaussianBlur(full, (0, 0), self._optics.blur_sigma_px)
         picture *= view.vignette
         picture.setflags(write=False)
         return picture
+
+    def _look(self, view: View, scene: WorldScene, index: int) -> Seen:
+        key = (scene.digest, index)
+        if key not in self._seen:
+            while len(self._seen) >= LIT_KEPT:
+                del self._seen[next(iter(self._seen))]
+            self._seen[key] = self._with_parts(view, scene, self._cast(scene), self._silhouettes(scene, index, view.crop))
+        return self._seen[key]
+
+    def _surround(self, index: int, pattern: int | None) -> Radiance:
+        """The whole picture of the empty bin under a pattern that few ask for: its light is worked out when first asked."""
+        if index not in self._surrounds:
+            nothing = WorldScene(self._world, (), 0, 0)
+            rays = self._rays(index).reshape(-1, 6)
+            caster = Caster(nothing)
+            self._surrounds[index] = self._shaded(rays, caster.cast(rays), nothing).lit(nothing, caster, self._optics)
+        width, height = self._rig.image_size_px
+        return radiance(self._surrounds[index], (height, width), self._projector, pattern, self._optics)
 
     def _cast(self, scene: WorldScene) -> Caster:
         if self._caster is None or self._caster[0] != scene.digest:
             self._caster = (scene.digest, Caster(scene))
         return self._caster[1]
 
-    def _with_parts(self, view: View, scene: WorldScene, caster: Caster, maybe: Pixels) -> Shading:
-        """The background's shading, shaded anew only where parts are, which is among the pixels `maybe`."""
+    def _with_parts(self, view: View, scene: WorldScene, caster: Caster, maybe: Pixels) -> Seen:
+        """The background, shaded anew only where parts are, which is among the pixels `maybe`."""
         hits = caster.cast(view.rays[maybe])
         of_parts = np.flatnonzero(hits.part_id > 0)
-        seen = maybe[of_parts]
-        parts = self._shaded(view.rays[seen], hits.take(of_parts), scene)
-        b = view.background
-        shading = Shading(b.albedo.copy(), b.ambient.copy(), b.projected.copy(), b.to_light.copy())
-        shading.albedo[seen], shading.ambient[seen] = parts.albedo, parts.ambient
-        shading.projected[seen], shading.to_light[seen] = parts.projected, parts.to_light
-        return shading
+        places, hits = maybe[of_parts], hits.take(of_parts)
+        rays = view.rays[places]
+        lit = view.background.with_points(places, self._shaded(rays, hits, scene)).lit(scene, caster, self._optics)
+        if not any(exam.KINDS[part.kind].mirror for part in scene.parts):
+            return Seen(lit, None)
+        metal = mirrored(scene, caster, rays, hits, view.pixel_steps, self._projector, self._optics)
+        return Seen(lit, replace(metal, pixels=places[metal.pixels]))
 
     def _silhouettes(self, scene: WorldScene, index: int, crop: tuple[slice, slice]) -> Pixels:
         """Pixels of the crop, counted row by row, that can show a part: the hulls of their corners, generously."""
@@ -123,28 +163,31 @@ class Renderer:
         return np.flatnonzero(cv2.dilate(mask, np.ones((7, 7), np.uint8)))
 
     def _shaded(self, rays: Rays, hits: Hits, scene: WorldScene) -> Shading:
-        # what misses even the table is drawn as far table
-        points = rays[:, :3] + rays[:, 3:] * np.minimum(hits.distance, 10.0)[:, None]
-        away = np.einsum("ij,ij->i", hits.normal, rays[:, 3:]) > 0
-        normals = np.where(away[:, None], -hits.normal, hits.normal)
-        reflectance, gloss = (table[hits.part_id - TABLE_ID] for table in materials(scene, self._optics))
-        return shade(points, normals, -rays[:, 3:], reflectance, gloss, self._projector, self._optics)
+        points, normals = ends(rays, hits)
+        table, index = materials(scene, self._optics), hits.part_id - TABLE_ID
+        return shade(points, normals, -rays[:, 3:], table.reflectance[index], table.gloss[index], self._optics.gloss_power,
+                     self._projector, self._optics)
+
+    def _rays(self, index: int) -> Float32[np.ndarray, "h w 6"]:
+        camera = self._rig.cameras[index]
+        T_cam_bin = camera.T_camera_rig @ exam.setup(self._world).T_camera_bin
+        return _rays(camera.K_px, camera.distortion_coefficients, T_cam_bin, self._rig.image_size_px)
 
     def _view(self, index: int) -> View:
         setup, camera, size = exam.setup(self._world), self._rig.cameras[index], self._rig.image_size_px
         T_cam_bin = camera.T_camera_rig @ setup.T_camera_bin
-        rays = _rays(camera.K_px, camera.distortion_coefficients, T_cam_bin, size)
+        rays = self._rays(index)
         nothing = WorldScene(self._world, (), 0, 0)
         caster = self._cast(nothing)
         everywhere = rays.reshape(-1, 6)
         shading = self._shaded(everywhere, caster.cast(everywhere), nothing)
-        dark, lit = (radiance(shading, rays.shape[:2], nothing, caster, pattern, self._optics) for pattern in (False, True))
+        lit = shading.lit(nothing, caster, self._optics)
+        empty = {pattern: radiance(lit, rays.shape[:2], self._projector, pattern, self._optics) for pattern in (None, 0)}
         corners = _outline(setup)
         crop = _crop(geometry.transform(T_cam_bin, corners), camera.K_px, camera.distortion_coefficients, size)
         inside = np.arange(size[0] * size[1]).reshape(size[1], size[0])[crop].ravel()
-        background = Shading(shading.albedo[inside], shading.ambient[inside], shading.projected[inside],
-                             shading.to_light[inside])
-        return View(_vignette(size, self._optics), (dark, lit), crop, everywhere[inside], background)
+        steps = (T_cam_bin[:2, :3] / np.diag(camera.K_px)[:2, None]).astype(np.float32)
+        return View(_vignette(size, self._optics), empty, crop, everywhere[inside], steps, shading.take(inside))
 
 
 def _rays(K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "n"], T_cam_bin: geometry.Transform,

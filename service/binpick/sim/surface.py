@@ -1,14 +1,14 @@
 """How bright a point of the world looks: pattern, ambient light and lamp on diffuse and glossy surfaces."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from binpick.sim import exam
-from binpick.sim.mesh import BIN_ID, TABLE_ID, Caster, Rays
+from binpick.sim.mesh import BIN_ID, TABLE_ID, Caster, Hits, Rays
 from binpick.sim.projector import Projector, sample
 from binpick.sim.world import WorldScene
 
@@ -20,61 +20,116 @@ OFF_SURFACE_M = 2e-4
 HEIGHT_CELL_M, HEIGHT_MARGIN_M, HEIGHT_SIGMA_M = 0.005, 0.1, 0.018
 # one bounce of light is gathered from about this many px around, on an image 8 times smaller
 BOUNCE_PX, BOUNCE_SHRINK = 28.0, 8
+# what misses even the table is drawn as table this far away, metres
+FAR_M = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shading:
-    """Radiance towards the eye before anything stands in the light: from all around, and from the projector.
+class Materials:
+    """Of each id, counted from TABLE_ID: diffuse reflectance, strength of the gloss, reflectance as a mirror."""
 
-    `to_light` are the rays (from just off the surface, ending after one ray length at the projector) that shadow it.
+    reflectance: Values
+    gloss: Values
+    mirror: Values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lit:
+    """Radiance of points towards the eye: from all around, and per brightness of the projector's picture.
+
+    The latter is `glow` times `falloff` (by distance) times the picture's cell at `column`, `row`; `dots` are these cells of
+    pattern 0, which is asked for most.
     """
 
     albedo: Values
     ambient: Values
-    projected: Values
+    glow: Values
+    falloff: Values
+    column: Values
+    row: Values
+    dots: Values
+
+    def direct(self, projector: Projector, pattern: int | None) -> Values:
+        """Radiance by direct light alone under a pattern (None: the projector is off). Raises InputError."""
+        if pattern is None:
+            return self.ambient
+        cells = self.dots if pattern == 0 else sample(projector.picture(pattern), self.column, self.row, cv2.BORDER_CONSTANT)
+        direct: Values = self.ambient + self.glow * (cells * self.falloff)
+        return direct
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shading(Lit):
+    """The same before anything stands in the light.
+
+    `to_light` are the rays (from just off the surface, ending after one ray length at the projector) that shadow it.
+    """
+
     to_light: Rays
 
+    def take(self, index: Int[np.ndarray, "m"]) -> "Shading":
+        """Some of the points."""
+        return Shading(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
-def shade(points: Points, normals: Points, to_eye: Points, reflectance: Values, gloss: Values, projector: Projector,
-          optics: exam.Optics) -> Shading:
+    def with_points(self, places: Int[np.ndarray, "m"], points: "Shading") -> "Shading":
+        """A copy with other points at some places."""
+        copies = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, values in copies.items():
+            values[places] = getattr(points, name)
+        return Shading(**copies)
+
+    def lit(self, scene: WorldScene, caster: Caster, optics: exam.Optics) -> Lit:
+        """The points in what light the scene leaves them."""
+        return Lit(self.albedo, self.ambient * _openness(self.to_light, scene, caster, optics),
+                   self.glow * ~caster.blocked(self.to_light, 0.0, 1.0), self.falloff, self.column, self.row,
+                   self.dots)
+
+
+def ends(rays: Rays, hits: Hits) -> tuple[Points, Points]:
+    """Where rays of length 1 end, and the surface's normals on the side they come from."""
+    points = rays[:, :3] + rays[:, 3:] * np.minimum(hits.distance, FAR_M)[:, None]
+    away = np.einsum("ij,ij->i", hits.normal, rays[:, 3:]) > 0
+    return points, np.where(away[:, None], -hits.normal, hits.normal)
+
+
+def shade(points: Points, normals: Points, to_eye: Points, reflectance: Values, gloss: Values, gloss_power: int,
+          projector: Projector, optics: exam.Optics) -> Shading:
     """Shades points of frame `bin`; normals look to the eye's side, `to_eye` has length 1."""
     albedo = reflectance * _texture(points, optics)
     lamp = np.array(optics.lamp_direction, np.float32) / np.float32(np.linalg.norm(optics.lamp_direction))
     around = np.float32(optics.ambient) * (np.float32(0.65) + np.float32(0.35) * normals[:, 2])
     ambient = albedo * (around + np.float32(optics.lamp) * np.maximum(normals @ lamp, 0))
-    ambient += gloss * np.float32(optics.lamp) * _highlight(normals, to_eye + lamp, optics.gloss_power)
+    ambient += gloss * np.float32(optics.lamp) * _highlight(normals, to_eye + lamp, gloss_power)
     to_light = np.empty((len(points), 6), np.float32)
     to_light[:, :3] = points + normals * np.float32(OFF_SURFACE_M)
     to_light[:, 3:] = projector.position_m.astype(np.float32) - points
     square = _dot(to_light[:, 3:], to_light[:, 3:])
     direction = to_light[:, 3:] / np.sqrt(square)[:, None]
     facing = _dot(normals, direction)
-    projected = albedo * facing + gloss * _highlight(normals, to_eye + direction, optics.gloss_power)
-    projected *= projector.light(points) * (np.float32(optics.projector) / square)
-    return Shading(albedo, ambient, np.where(facing > 0, projected, np.float32(0)), to_light)
+    glow = albedo * facing + gloss * _highlight(normals, to_eye + direction, gloss_power)
+    column, row = projector.place(points)
+    dots = sample(projector.picture(0), column, row, cv2.BORDER_CONSTANT)
+    return Shading(albedo, ambient, np.where(facing > 0, glow, np.float32(0)), np.float32(optics.projector) / square,
+                   column, row, dots, to_light)
 
 
-def radiance(shading: Shading, shape: tuple[int, int], scene: WorldScene, caster: Caster, pattern: bool,
-             optics: exam.Optics) -> Grid:
-    """The picture (not yet blurred) of the points of a grid, with what stands in the light and the light they hand on."""
-    direct = shading.ambient * _openness(shading.to_light, scene, caster, optics)
-    if pattern:
-        direct += shading.projected * ~caster.blocked(shading.to_light, 0.0, 1.0)
-    picture: Grid = direct.reshape(shape)
-    return picture + shading.albedo.reshape(shape) * (np.float32(optics.interreflection) * _bounced(picture))
+def radiance(lit: Lit, shape: tuple[int, int], projector: Projector, pattern: int | None, optics: exam.Optics) -> Grid:
+    """What the points of a grid (not yet blurred) show under a pattern, with the light they hand on. Raises InputError."""
+    direct: Grid = lit.direct(projector, pattern).reshape(shape)
+    return direct + lit.albedo.reshape(shape) * (np.float32(optics.interreflection) * _bounced(direct))
 
 
-def materials(scene: WorldScene, optics: exam.Optics) -> tuple[Values, Values]:
-    """Reflectance and gloss by id − TABLE_ID; no two parts of a kind are quite alike."""
+def materials(scene: WorldScene, optics: exam.Optics) -> Materials:
+    """No two parts of a kind are quite alike."""
     count = max([BIN_ID, *(p.part_id for p in scene.parts)]) - TABLE_ID + 1
-    reflectance, gloss = np.full(count, optics.table_reflectance), np.zeros(count)
+    reflectance, gloss, mirror = np.full(count, optics.table_reflectance), np.zeros(count), np.zeros(count)
     reflectance[BIN_ID - TABLE_ID], gloss[BIN_ID - TABLE_ID] = optics.bin_reflectance, optics.bin_gloss
     for part in scene.parts:
         kind = exam.KINDS[part.kind]
         spread = np.random.default_rng((scene.seed, part.part_id)).uniform(-1, 1) * optics.reflectance_spread
         reflectance[part.part_id - TABLE_ID] = kind.reflectance * (1 + spread)
-        gloss[part.part_id - TABLE_ID] = kind.gloss
-    return reflectance.astype(np.float32), gloss.astype(np.float32)
+        gloss[part.part_id - TABLE_ID], mirror[part.part_id - TABLE_ID] = kind.gloss, kind.mirror
+    return Materials(*(values.astype(np.float32) for values in (reflectance, gloss, mirror)))
 
 
 def _openness(to_light: Rays, scene: WorldScene, caster: Caster, optics: exam.Optics) -> Values:

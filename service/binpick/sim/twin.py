@@ -43,5 +43,5 @@ class Twin:
         """Shows the cameras the world as it is now, with the pattern on as the recipes ask."""
         scene = self._world.scene()
         for index in (0, 1):
-            self._renderer.radiance(scene, index, True)
+            self._renderer.radiance(scene, index, 0)
         self._scene = scene
