@@ -35,7 +35,8 @@ from binpick.scene import heightmap
 from binpick.scene import segment as segmentation
 from binpick.scene.surface import surface
 from binpick.settings import Job
-from binpick.stereo import cloud, filter, match, rectify
+from binpick.stereo import cloud, rectify
+from binpick.stereo import depth as stereo
 
 LEAST_MEASURED = 0.20
 """Below this share of measured pixels in the window there is no depth to speak of."""
@@ -65,11 +66,9 @@ def run(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
         rect = rectify.rectification(inputs.rig)
         box = load_carrier.search_box(inputs.job.bin, inputs.job.recipe.limits.above_rim_m)
         view = rectify.visible(rect, inputs.rig, rectify.window(rect, frames.T_camera_bin, *box))
-        rectified = rectify.rectify(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, view)
+        shots = tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
     with clock.stage("match"):
-        matched = match.match(rectified, inputs.job.recipe.stereo)
-    with clock.stage("filter"):
-        depth = filter.measure(matched, rectified, inputs.job.recipe.stereo)
+        rectified, depth = stereo.of_shots(shots, inputs.job.recipe.lights, inputs.job.recipe.stereo)
     with clock.stage("cloud"):
         points = cloud.reproject(depth, rectified)
     return _scene(inputs, frames, clock, rectified, depth, points)
@@ -133,7 +132,7 @@ def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tu
     T_reach_frame = frames.T_reach_bin @ T_bin_frame
     messages: list[GraspMessage] = []
     stopped: dict[str, int] = {}
-    fresh = all(f.received_ns > f.triggered_ns for f in (inputs.pair.left, inputs.pair.right))
+    fresh = all(frame.received_ns > frame.triggered_ns for pair in inputs.pairs for frame in (pair.left, pair.right))
     for grasp in kept:
         objection = gate.malformed(grasp) if fresh else "older_than_trigger"
         if not objection:
@@ -182,6 +181,8 @@ REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "collide")
 def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling,
             grasps: tuple[GraspMessage, ...] = (), counts: dict[str, int] | None = None) -> Result:
     pair, job = inputs.pair, inputs.job
+    worst = max(inputs.pairs, key=lambda shot: abs(shot.skew_us))
+    every = [frame for shot in inputs.pairs for frame in (shot.left, shot.right)]
     lost = {k: v for k, v in (counts or {}).items() if v and (k in REASONS or k.startswith("gate_"))}
     return Result(
         cycle_id=inputs.cycle_id, request=inputs.request, captured_at=pair.captured_at, simulated=inputs.simulated,
@@ -189,8 +190,8 @@ def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, 
         bin=BinMessage(found=True, number=job.bin.number, T_camera_bin=_pose(frames.T_camera_bin), fill_level=filled.level,
                        coverage=filled.coverage),
         grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
-        sync=SyncMessage(skew_us=pair.skew_us, sigma_us=pair.sigma_us, proof=pair.proof,
-                         resends=pair.left.resends + pair.right.resends, missing=pair.left.missing + pair.right.missing),
+        sync=SyncMessage(skew_us=worst.skew_us, sigma_us=worst.sigma_us, proof=worst.proof,
+                         resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every)),
         timing_ms=clock.spent(),
         inputs=Inputs(rig_sha256=inputs.rig.sha256, settings_sha256=job.sha256,
                       frame_ids=(pair.left.frame_id, pair.right.frame_id),

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from binpick import geometry, pipeline, recording
-from binpick.data import Grasp, StereoPair
+from binpick.data import Grasp, Light, StereoPair
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
 from binpick.lab import exam
 from binpick.result import CycleInput, PoseMessage, Request
+from binpick.settings.recipe import Shot
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +162,41 @@ def test_time_can_run_out_between_stages(paper):
 
     with pytest.raises(OutOfTime):
         pipeline.run(paper.inputs, proceed)
+
+
+def shot(paper: exam.Paper, light: Light, number: int) -> StereoPair:
+    images = [exam.renderer("A").expose(paper.scene, index, light, number) for index in (0, 1)]
+    inputs = with_images(paper.inputs, *images)
+    return replace(inputs.pair, skew_us=-40.0 * number, left=replace(inputs.pair.left, resends=number))
+
+
+@pytest.fixture(scope="module")
+def several(paper) -> CycleInput:
+    """The first shot, a short one, and one without the projector."""
+    recipe = paper.inputs.job.recipe.model_copy(update={"shots": (Shot(), Shot(exposure_us=1200.0), Shot(projector=False))})
+    more = tuple(shot(paper, light, number) for number, light in enumerate(recipe.lights[1:], start=1))
+    return replace(paper.inputs, job=paper.inputs.job.model_copy(update={"recipe": recipe}), more=more)
+
+
+def test_several_shots_are_measured_together(several, outcome):
+    result = pipeline.run(several)
+    assert result.result.return_code.code is Code.OK
+    assert not np.array_equal(result.rectified.left, outcome.rectified.left)
+    assert abs(float(result.depth.measured.mean()) - float(outcome.depth.measured.mean())) < 0.1
+    both = result.depth.measured & outcome.depth.measured
+    assert np.median(np.abs(result.depth.disparity - outcome.depth.disparity)[both]) < 0.2
+    sync = result.result.sync
+    assert (sync.skew_us, sync.resends) == (-80.0, 3)          # the worst pair's, and all of them
+
+
+def test_a_recording_of_several_shots_gives_the_same_bytes(several, tmp_path):
+    live = pipeline.run(several).result
+    recording.save(tmp_path / "cycle", several, live)
+    inputs, _ = recording.load(tmp_path / "cycle")
+    assert pipeline.run(inputs).result.timeless_bytes() == live.timeless_bytes()
+
+
+def test_a_later_shot_older_than_its_trigger_stops_the_poses(several):
+    first, last = several.more
+    stale = replace(last, left=replace(last.left, received_ns=last.left.triggered_ns))
+    assert set(pipeline.run(replace(several, more=(first, stale))).result.stopped) == {"older_than_trigger"}
