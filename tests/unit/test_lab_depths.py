@@ -18,7 +18,8 @@ from binpick.sim.truth import Truth
 from binpick.stereo import depth
 
 ROWS, COLUMNS = 90, 140
-FLOOR, BLOCK, CYLINDER = 0, 1, 2
+BLOCK, CYLINDER = 1, 2
+MIXED, DARK = Series("mixed_A", "A"), Series("no_projector_A", "A", projector=False)
 
 
 def truth() -> Truth:
@@ -55,7 +56,7 @@ def sheet() -> Sheet:
     maps = {methods.PLAIN: plain_sgbm(pair)} | {name: method(pair) for name, method in methods.others().items()}
     maps |= {name: measured.disparity for name, measured in found.items()}
     seconds = {name: [0.5, 0.3] if name in PRESETS else [0.2] for name in maps}
-    return Sheet(Series("A"), depths.mark(1, pair, true, kinds, maps, found, seconds), pair, true, maps, found)
+    return Sheet(MIXED, depths.mark(1, pair, true, kinds, maps, found, seconds), pair, true, maps, found)
 
 
 def test_the_truth_tells_planes_round_faces_and_edges_apart():
@@ -131,7 +132,7 @@ def test_figures_pool_pixels_and_name_the_worst_scene():
     nan = np.nan
     scenes = [marked(1, [0.1, 0.3, 0.2, nan], [P, P, E, E], [0.2, 0.2, 0.1, nan]),
               marked(2, [-0.1, -3.0, 0.7, 5.0], [P, P, E, E], [0.2, 2.0, 1.0, 1.0], seconds=0.2)]
-    figures = marks.figures(Series("A"), scenes)
+    figures = marks.figures(MIXED, scenes)
     row = figures["rows"]["quality"]
     assert row["density"] == pytest.approx(7 / 8)
     assert (row["bad05"], row["bad1"], row["bad2"]) == pytest.approx((3 / 7, 2 / 7, 2 / 7), abs=1e-4)
@@ -149,9 +150,16 @@ def test_figures_pool_pixels_and_name_the_worst_scene():
 
 def test_nothing_measured_is_no_figure_and_no_fault():
     nan = np.nan
-    figures = marks.figures(Series("A", projector=False), [marked(1, [nan, nan], [depths.PLANE, depths.EDGE], [nan, nan])])
+    figures = marks.figures(DARK, [marked(1, [nan, nan], [depths.PLANE, depths.EDGE], [nan, nan])])
     assert figures["rows"]["quality"]["density"] == 0
     assert figures["rows"]["quality"]["bad2"] is None
     json.dumps(figures, allow_nan=False)
     run = {"exam_sha256": "0" * 64, "threads": 2, "middlebury": {}, "series": {"no_projector_A": figures}}
     Console(width=150, file=io.StringIO()).print(tables.tables(run))
+
+
+def test_every_series_has_a_title_and_its_own_name():
+    names = [series.name for series in depths.SERIES]
+    assert len(set(names)) == len(names)
+    assert set(names) == set(tables.TITLES)
+    assert set(tables.NAMES) == {methods.PLAIN, *methods.others(), *methods.OURS}

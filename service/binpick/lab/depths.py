@@ -16,6 +16,7 @@ from binpick.lab.regions import Regions, regions
 from binpick.lab.stereo import Field, plain_matcher, plain_sgbm
 from binpick.scene import bin as load_carrier
 from binpick.settings import PRESETS, StereoSettings
+from binpick.settings.recipe import Shot
 from binpick.sim.truth import Truth
 from binpick.stereo import depth, rectify
 
@@ -26,19 +27,25 @@ CREASE, PLANE, CURVED, EDGE = range(4)
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Scenes of one kind: the world, what lies in the bin, and whether dots are thrown on it."""
+    """Scenes of one kind: the world, what lies in the bin, whether dots are thrown on it, and the shots of a cycle.
 
+    Without `shots` a cycle is one pair, the recipe's. With them ours gets them all, the other methods the first.
+    """
+
+    name: str
     world: str
     kinds: str = "mixed"
     projector: bool = True
-
-    @property
-    def name(self) -> str:
-        """As in the tables: mixed_A, metal_A, no_projector_A."""
-        return f"{self.kinds if self.projector else 'no_projector'}_{self.world}"
+    shots: tuple[Shot, ...] = ()
 
 
-SERIES = (Series("A"), Series("B"), Series("A", kinds="metal"), Series("A", projector=False))
+SHORT_US = 1200.0
+"""A fifth of the recipe's exposure: what glares at the long one shows its pattern at this one."""
+SERIES = (
+    Series("mixed_A", "A"), Series("mixed_B", "B"), Series("metal_A", "A", kinds="metal"),
+    Series("metal_shots_A", "A", kinds="metal",
+           shots=tuple(Shot(pattern=pattern, exposure_us=exposure) for pattern in (0, 1) for exposure in (None, SHORT_US))),
+    Series("no_projector_A", "A", projector=False))
 """In the order of the tables."""
 
 
@@ -97,7 +104,7 @@ class _Watch:
 def sit(series: Series, seeds: Iterable[int], repeats: int) -> Iterator[Sheet]:
     """One scene after the other; `repeats` timed runs of plain SGBM and of each preset, taking turns, one of the others."""
     for seed in seeds:
-        paper = exam.paper(series.world, seed, kinds=series.kinds, projector=series.projector)
+        paper = exam.paper(series.world, seed, kinds=series.kinds, projector=series.projector, shots=series.shots)
         yield answer(series, seed, paper, repeats)
 
 
@@ -107,8 +114,8 @@ def answer(series: Series, seed: int, paper: Paper, repeats: int) -> Sheet:
     Ours is timed from the camera's images to the measured map. Plain SGBM is OpenCV's bare call on images that are rectified
     already: nothing is charged to the yardstick.
     """
-    pair = rectified(paper)
-    depths = {name: depth.measure(pair, settings) for name, settings in PRESETS.items()}
+    pair = rectified(paper)[0]
+    depths = {name: _ours(paper, settings) for name, settings in PRESETS.items()}
     maps = {methods.PLAIN: plain_sgbm(pair)}
     watch = _Watch()
     matcher = plain_matcher(pair.window.num_disparities)
@@ -124,17 +131,17 @@ def answer(series: Series, seed: int, paper: Paper, repeats: int) -> Sheet:
 
 
 def _ours(paper: Paper, settings: StereoSettings) -> Depth:
-    return depth.measure(rectified(paper), settings)
+    return depth.of_shots(rectified(paper), paper.inputs.job.recipe.lights, settings)[1]
 
 
-def rectified(paper: Paper) -> Rectified:
-    """The bin's window of a paper's first pair, as the pipeline cuts it."""
+def rectified(paper: Paper) -> tuple[Rectified, ...]:
+    """The bin's window of every shot of a paper, as the pipeline cuts it."""
     inputs = paper.inputs
     rect, job = rectify.rectification(inputs.rig), inputs.job
     box = load_carrier.search_box(job.bin, job.recipe.limits.above_rim_m)
     wanted = rectify.window(rect, load_carrier.place(job.bin, inputs.T_base_camera), *box)
     view = rectify.visible(rect, inputs.rig, wanted)
-    return rectify.rectify(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, view)
+    return tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
 
 
 def mark(seed: int, pair: Rectified, truth: Truth, kinds: dict[int, str], maps: dict[str, Field], depths: dict[str, Depth],

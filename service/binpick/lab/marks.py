@@ -25,6 +25,7 @@ def figures(series: Series, scenes: Sequence[Marked]) -> Figures:
     apart = (methods.PLAIN, *methods.OURS)
     return {
         "world": series.world, "kinds": series.kinds, "projector": series.projector,
+        "shots": max(1, len(series.shots)),
         "seeds": [s.seed for s in scenes],
         "part_pixels": sum(len(s.truth_px) for s in scenes),
         "rows": {name: _row(scenes, name) for name in scenes[0].answers},

@@ -8,7 +8,8 @@ from rich.table import Table
 from binpick.lab import methods
 
 TITLES = {
-    "mixed_A": "world A, mixed parts", "mixed_B": "world B, mixed parts", "metal_A": "world A, shiny metal",
+    "mixed_A": "world A, mixed parts", "mixed_B": "world B, mixed parts", "metal_A": "world A, dark shiny steel",
+    "metal_shots_A": "world A, dark shiny steel, ours from two patterns in two exposures",
     "no_projector_A": "world A, mixed parts, projector off",
 }
 NAMES = {
