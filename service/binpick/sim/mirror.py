@@ -1,6 +1,6 @@
 """What bare metal shows beside its own faint colour: its surroundings, pattern and all, and glare, by one bounce of rays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int
@@ -16,16 +16,20 @@ PLACES_PX = np.array([[-5, 1], [5, -1], [-3, -5], [3, 5], [-1, 3], [1, -3]], np.
 # ... at six facets of the rough surface: their normals lean by these times the roughness (mean 0, spread 1 along every axis)
 LEANS = np.sqrt(3, dtype=np.float32) * np.vstack([np.eye(3), -np.eye(3)]).astype(np.float32)
 SAMPLES = len(LEANS)
+# glare below this radiance is left out: a third of one grey level at the usual exposure
+DIM = np.float32(1e-3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mirrored:
     """The light that metal pixels send on unchanged: `glare` of lamp and projector, and `share` of each thing reflected.
 
-    `pixels` are places in the rays it was made of; every pixel has SAMPLES of the others, one after the other.
+    `pixels` are places in the rays it was made of; every pixel has SAMPLES of the others, one after the other. Only the
+    samples `glaring` have glare.
     """
 
     pixels: Int[np.ndarray, "n"]
+    glaring: Int[np.ndarray, "k"]
     glare: Lit
     reflected: Lit
     share: Float32[np.ndarray, "m"]
@@ -33,9 +37,9 @@ class Mirrored:
 
     def radiance(self, projector: Projector, pattern: int | None) -> Values:
         """What the pixels show under a pattern (None: the projector is off). Raises InputError."""
-        seen = self.share * self.reflected.direct(projector, pattern)
-        light = self.weight * (self.glare.direct(projector, pattern) + seen)
-        total: Values = light.reshape(-1, SAMPLES).sum(axis=1)
+        light = self.share * self.reflected.direct(projector, pattern)
+        light[self.glaring] += self.glare.direct(projector, pattern)
+        total: Values = (self.weight * light).reshape(-1, SAMPLES).sum(axis=1)
         return total
 
 
@@ -53,18 +57,19 @@ def mirrored(scene: WorldScene, caster: Caster, rays: Rays, hits: Hits, pixel_st
     seen = caster.cast(looking)
     part_id = np.repeat(hits.part_id[pixels], SAMPLES)
     same = seen.part_id == part_id
-    points = ends(looking, seen)[0]
-    seen = Hits(seen.distance, seen.part_id, rounded(scene, points, seen))
     points, normals = ends(looking, seen)
+    normals = rounded(scene, points, replace(seen, normal=normals))
     nothing = np.zeros(len(points), np.float32)
     glare = shade(points, normals, -looking[:, 3:], nothing, nothing + np.float32(optics.metal_gloss),
-                  optics.metal_gloss_power, projector, optics).lit(scene, caster, optics)
+                  optics.metal_gloss_power, projector, optics)
+    glaring = np.flatnonzero((glare.glow > DIM) | (glare.ambient > DIM))
     leaning = normals + np.float32(optics.metal_roughness_rad) * np.tile(LEANS, (len(pixels), 1))
     bounced, cosine = _bounced(points, normals, leaning, looking[:, 3:])
     squarely = mirror[part_id - TABLE_ID]
     # Schlick 1994: every surface mirrors fully at grazing incidence
     share = squarely + (1 - squarely) * (1 - cosine) ** 5
-    return Mirrored(pixels, glare, _surroundings(scene, caster, bounced, projector, optics), share, _weights(same))
+    return Mirrored(pixels, glaring, glare.take(glaring).lit(scene, caster, optics),
+                    _surroundings(scene, caster, bounced, projector, optics), share, _weights(same))
 
 
 def _bounced(points: Points, normals: Points, leaning: Points, looking: Points) -> tuple[Rays, Values]:
