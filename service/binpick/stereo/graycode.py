@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, Int16, Int32
+from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from binpick.data import (
     BLACK_PATTERN,
@@ -18,6 +18,7 @@ from binpick.data import (
     Rectified,
     frozen,
 )
+from binpick.stereo import direct
 from binpick.stereo.match import SCALE
 
 LEAST_CONTRAST = 8
@@ -51,6 +52,10 @@ class _Edges:
     x: Float32[np.ndarray, "n"]
     row: Int32[np.ndarray, "n"]
     sigma: Float32[np.ndarray, "n"]
+
+    def take(self, some: Bool[np.ndarray, "n"]) -> "_Edges":
+        """Some of them, in order."""
+        return _Edges(self.key[some], self.y[some], self.x[some], self.row[some], self.sigma[some])
 
 
 def complete(lights: tuple[Light, ...]) -> bool:
@@ -98,12 +103,12 @@ def decode(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> tuple[Dis
     left = _edges([shot.left for shot in sequence])
     right = _edges([shot.right for shot in sequence])
     partner = _partners(left, right, view.num_disparities)
-    matched = partner >= 0
-    left_x, left_y = left.x[matched], left.y[matched]
-    disparity = left_x - right.x[partner[matched]] + np.float32(view.min_disparity)
-    sigma = np.sqrt(left.sigma[matched] ** 2 + right.sigma[partner[matched]] ** 2 + np.float32(FLOOR_PX**2))
-    rows, cols = shots[0].left.shape
-    dense, noise = _between(left_y, left_x, disparity, sigma, (rows, cols))
+    left, partner = left.take(partner >= 0), partner[partner >= 0]
+    disparity = left.x - right.x[partner] + np.float32(view.min_disparity)
+    kept = direct.seen(np.stack([left.x, left.y, disparity], axis=-1).astype(float),
+                       np.stack([left.key % GRAY_CODE_SIZE_PX[0], left.row], axis=-1).astype(float))
+    sigma = np.sqrt(left.sigma**2 + right.sigma[partner] ** 2 + np.float32(FLOOR_PX**2))
+    dense, noise = _between(left.y[kept], left.x[kept], disparity[kept], sigma[kept], shots[0].left.shape)
     margin = shots[0].margin
     return frozen(np.ascontiguousarray(dense[:, margin:])), frozen(np.ascontiguousarray(noise[:, margin:]))
 
