@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from binpick.data import Depth, Image, Light, Mask, Rectified, frozen
+from binpick.data import Depth, Image, Light, Rectified
 from binpick.settings import StereoSettings
 from binpick.stereo import filter, graycode, match, shots
 
@@ -27,19 +27,11 @@ def of_shots(taken: tuple[Rectified, ...], lights: tuple[Light, ...], settings: 
     """The pair that stands for a cycle's shots, and their depth; `lights` says what each was exposed with.
 
     A Gray code is read where there is one. Else the shots are combined, each pattern of dots is matched by itself, and a pixel
-    is measured where all patterns agree and no highlight shines that only one camera sees. One shot is simply matched.
+    is measured where all patterns agree. One shot is simply matched.
     """
     if graycode.complete(lights):
         return taken[0], graycode.measure(taken, lights, settings.speckle_px)
     if len(taken) == 1:
         return taken[0], measure(taken[0], settings)
     combined = shots.combine(taken, lights)
-    depth = shots.fuse(tuple(measure(pair, settings, combined.guide) for pair in combined.pairs))
-    return combined.matched, _without(depth, combined.glare(depth.disparity))
-
-
-def _without(depth: Depth, mask: Mask) -> Depth:
-    """Less some pixels."""
-    nan = np.float32(np.nan)
-    return replace(depth, disparity=frozen(np.where(mask, nan, depth.disparity)), measured=frozen(depth.measured & ~mask),
-                   sigma_px=frozen(np.where(mask, nan, depth.sigma_px)))
+    return combined.matched, shots.fuse(tuple(measure(pair, settings, combined.guide) for pair in combined.pairs))

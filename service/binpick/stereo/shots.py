@@ -1,18 +1,19 @@
-"""Several shots of one scene become what is matched: exposures merged, ambient light taken out, patterns side by side."""
+"""Several shots of one scene become what is matched: exposures merged, glare taken out, patterns side by side."""
 
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32
 
-from binpick.data import DOT_PATTERNS, Depth, Disparity, Image, Light, Mask, Rectified, frozen
+from binpick.data import DOT_PATTERNS, Depth, Disparity, Image, Light, Rectified, frozen
 
 Linear = Float32[np.ndarray, "h w"]
 SAFE, SATURATED = 200, 250
 """Grey levels: to the first a pixel counts fully, from the second on not at all; rectifying mixes 255 with its neighbours."""
-BLOB_PX = 7
-"""A pixel is blind when most of this square around it is saturated; single saturated dots are as good as others."""
+GLARE = 2.0
+"""Times as bright as the median of the plain light, from which it is glare. All plain light taken out cost up to a fifth of the
+measured pixels of the exam's steel and made bad-2 no better: what it shows of the parts themselves is worth matching."""
 DISAGREEMENT_PX, SIGMAS = 1.0, 3.0
 """Patterns disagree when their disparities differ by more than both."""
 
@@ -21,41 +22,26 @@ DISAGREEMENT_PX, SIGMAS = 1.0, 3.0
 class Shots:
     """What the matcher gets: one pair per dot pattern, at least one.
 
-    `guide` is the left image without the pattern, on the pairs' grid, where such a shot was taken. `blind` are the window's
-    pixels that are saturated in every shot with dots, or in every one without, `blind_right` the right images', on their grid.
+    `guide` is the left image without the pattern, on the pairs' grid, where such a shot was taken.
     """
 
     pairs: tuple[Rectified, ...]
-    guide: UInt8[np.ndarray, "h grid"] | None
-    blind: Mask
-    blind_right: Bool[np.ndarray, "h grid"]
+    guide: Image | None
 
     @property
     def matched(self) -> Rectified:
         """The first pattern's pair."""
         return self.pairs[0]
 
-    def glare(self, disparity: Disparity) -> Mask:
-        """The matches (absolute disparity, px, NaN: none) that are blind in one view only: what shines is not on the surface.
-
-        What is saturated in both views is held by its rim and errs less than other pixels (measured on the exam's steel).
-        """
-        if not self.blind.any() and not self.blind_right.any():
-            return self.blind
-        first = self.matched.margin + self.matched.window.min_disparity
-        own = np.arange(first, first + disparity.shape[1], dtype=np.float32)
-        place = np.nan_to_num(own - disparity).round().astype(np.intp).clip(0, self.blind_right.shape[1] - 1)
-        one_sided: Mask = (np.take_along_axis(self.blind_right, place, axis=1) ^ self.blind) & np.isfinite(disparity)
-        return frozen(one_sided)
-
 
 def combine(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> Shots:
     """What to match of a cycle's shots; `lights` says what each was exposed with. Gray-code shots are left to `graycode`.
 
     Shots of one pattern that differ in exposure become one image (the longest exposure that is not saturated, brought to one
-    scale, its square root taken so that dark contrast survives 8 bits). Shots without the projector are subtracted from those
-    with it, and guide the filter; without any of the latter they are themselves matched. Both cameras are treated alike.
-    Raises ValueError when there is nothing to match.
+    scale, its square root taken so that dark contrast survives 8 bits). Shots without the projector show what glares by itself:
+    that is taken out of the others, and they guide the filter; alone they are themselves matched. Both cameras are treated
+    alike. No mask of saturated pixels is needed: a blob of them has no texture, which the filter drops, and along its rim they
+    err less than others (measured on the exam's steel). Raises ValueError when there is nothing to match.
     """
     taken = list(zip(shots, lights, strict=True))
     patterns: dict[int, list[tuple[Rectified, Light]]] = {}
@@ -70,10 +56,7 @@ def combine(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> Shots:
     dots, ambient = [_view(group) for group in patterns.values()], _view(plain) if plain else None
     base = taken[0][0]
     pairs = tuple(replace(base, left=left, right=right) for left, right in (_pair(view, ambient) for view in dots))
-    blind, blind_right = (_blind([view.saturated(side) for view in dots], ambient.saturated(side) if ambient else None)
-                          for side in (0, 1))
-    guide = ambient.compressed(0) if ambient else None
-    return Shots(pairs, guide, frozen(np.ascontiguousarray(blind[:, base.margin:])), blind_right)
+    return Shots(pairs, ambient.compressed(0) if ambient else None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,11 +93,6 @@ class _View:
             left_over = left_over - weight
         return total
 
-    def saturated(self, index: int) -> Mask:
-        """In every exposure: the shortest decides."""
-        shortest = min(range(len(self.exposures)), key=lambda k: self.exposures[k])
-        return np.asarray(self.side(index)[shortest] >= SATURATED)
-
     def compressed(self, index: int) -> Image:
         """As it was when there is only one exposure."""
         images = self.side(index)
@@ -130,8 +108,17 @@ def _pair(dots: _View, ambient: _View | None) -> tuple[Image, Image]:
     if ambient is None:
         return dots.compressed(0), dots.compressed(1)
     scale = np.float32(dots.longest / ambient.longest)
-    left, right = (_compressed(cv2.max(dots.linear(side) - ambient.linear(side) * scale, 0.0), dots.top) for side in (0, 1))
+    plain = ambient.linear(0), ambient.linear(1)
+    usual = np.float32(GLARE * (_median(plain[0]) + _median(plain[1])) / 2)
+    left, right = (_compressed(cv2.max(dots.linear(side) - cv2.max(plain[side] - usual, 0.0) * scale, 0.0), dots.top)
+                   for side in (0, 1))
     return left, right
+
+
+def _median(plain: Linear) -> float:
+    """The usual brightness; the black beyond the rectified image does not count."""
+    seen = plain[plain > 0][::16]
+    return float(np.median(seen)) if len(seen) else 0.0
 
 
 def _compressed(linear: Linear, top: float) -> Image:
@@ -147,16 +134,6 @@ def _trust(image: Image) -> Linear:
     peak = cv2.dilate(image, np.ones((3, 3), np.uint8))
     levels = np.clip((SATURATED - np.arange(256, dtype=np.float32)) / (SATURATED - SAFE), 0, 1)
     return np.asarray(cv2.LUT(peak, levels.astype(np.float32)), np.float32)
-
-
-def _blind(dots: list[Mask], ambient: Mask | None) -> Mask:
-    """Blobs that are saturated under every pattern, or by the plain light already."""
-    everywhere = np.logical_and.reduce(dots)
-    if ambient is not None:
-        everywhere = everywhere | ambient
-    if not everywhere.any():
-        return frozen(everywhere)
-    return frozen(np.asarray(cv2.medianBlur(everywhere.astype(np.uint8), BLOB_PX) > 0))
 
 
 def fuse(depths: tuple[Depth, ...]) -> Depth:
