@@ -92,6 +92,15 @@ def test_a_skewed_pair_is_shot_again() -> None:
     assert (pair.skew_us, pair.left.sequence, pair.right.sequence) == (0.0, 3, 3)
 
 
+def test_a_numbered_pattern_is_not_shot_again() -> None:
+    left, right = Odd(0), Late(1)
+    right.late = 1
+    group = grouped(left, right)
+    with pytest.raises(PairRefused, match="9000 µs apart"):
+        group.capture(replace(LIGHT, pattern=9), within(2))
+    assert group.capture(replace(LIGHT, pattern=9), within(2)).left.sequence == 2
+
+
 def test_a_skew_that_stays_is_refused() -> None:
     left, right = Odd(0), Late(1)
     right.late = 100

@@ -19,7 +19,7 @@ IMAGE_NS = 1_000_000_000
 SECOND_NS = 150_000_000
 """What is left at least to fetch the second image, when waiting for the first has used up the time."""
 TRIES = 3
-"""Shots for one pair."""
+"""Shots for one pair; one of a projector's numbered patterns has a single one, since its next strobe shows the next pattern."""
 CLOCK_SIGMA_US = 1.0
 """Of time stamps on one clock: what PTP reaches on one switch."""
 
@@ -47,7 +47,8 @@ class CameraGroup:
         """One pair. Raises CameraError naming every camera that failed, PairRefused when two images are no pair.
 
         Two software triggers come too far apart when the host was busy between them: then it tries again, up to three times
-        in all. A dead camera is noticed within the exposure and 1.4 s, whatever the deadline is, and stays closed until `open`.
+        in all (a numbered pattern's shot has one try). A dead camera is noticed within the exposure and 1.4 s, whatever the
+        deadline is, and stays closed until `open`.
         The deadline ends no exposure that has begun, since a healthy camera is not to be blamed for a short one: it is looked
         at between the steps. Raises CycleTimeout then.
         """
@@ -55,7 +56,7 @@ class CameraGroup:
         # one whose shot the other's failure broke off may still expose, and would miss its next trigger
         self._each(lambda i, camera: self._due[i] and self._fetch(i, camera))
         self._configure(light)
-        for _ in range(TRIES):
+        for _ in range(1 if light.pattern else TRIES):
             if self._clock() >= deadline_ns:
                 raise CycleTimeout(Code.TIMEOUT.message)
             pair = self._shoot(light)

@@ -83,7 +83,8 @@ class Shot(Strict):
     projector: bool | None = None
     """Whether the pattern is on during exposure; a shot without it takes the ambient light's glare out of the others."""
     pattern: Annotated[int, Field(ge=0, le=BLACK_PATTERN)] = 0
-    """What a programmable projector shows: random dots 0 to 7, then a Gray code, of which a recipe has all shots or none."""
+    """What a programmable projector shows: random dots 0 to 7, then a Gray code (8 to 49), of which a recipe has all or none.
+    The projector must step on at each strobe, in the recipe's order."""
 
 
 class Limits(Strict):
