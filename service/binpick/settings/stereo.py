@@ -38,7 +38,7 @@ class Sgbm(Costs):
 
 
 class Hybrid(Costs):
-    """Semi-global matching on images shrunk by two, refined at full resolution."""
+    """Semi-global matching on images shrunk by two; planes carry what is found to every pixel."""
 
     kind: Literal["hybrid"] = "hybrid"
 
@@ -83,17 +83,15 @@ class StereoSettings(Strict):
     """Smoothness of the filled map."""
     wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
     """How strongly the filled map respects edges of the image."""
-    min_confidence: Annotated[int, Field(ge=0, le=255)] = 128
-    """WLS confidence from which a pixel counts as measured."""
-    edge_px: Annotated[int, Field(ge=0, le=10)] = 2
-    """Pixels next to a depth jump that do not count as measured: a matched block straddles the edge there."""
+    max_risk: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Probability of an error beyond 1 px up to which a match counts as measured."""
     speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
     """Islands of fewer pixels do not count as measured."""
 
 
 PRESETS = {
-    "quality": StereoSettings(),
-    "fast": StereoSettings(matcher=Hybrid()),
+    "quality": StereoSettings(matcher=Sgbm(block_px=3, p1=60, p2=400, uniqueness_percent=0)),
+    "fast": StereoSettings(matcher=Hybrid(block_px=3, p1=60, p2=400, uniqueness_percent=0), max_risk=0.55),
 }
 """What `stereo: quality` and `--preset` mean; fitted on the exam's tuning seeds."""
 

@@ -1,79 +1,63 @@
-"""Measured or not: WLS confidence, depth edges and speckle decide; the smoothed map is for people only."""
+"""The right view confirms the left: OpenCV's weighted least squares filter, its confidence, and a smooth map for people."""
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int16
+from jaxtyping import Float32, UInt8
 
-from binpick.data import Depth, Image, Mask, Rectified, frozen
+from binpick.data import Disparity, Image, Rectified
 from binpick.settings import StereoSettings
-from binpick.stereo.match import SCALE, Matched
+from binpick.settings.stereo import Onnx
+from binpick.stereo import pyramid, search
+from binpick.stereo.search import SCALE
 
-SGBM_SIGMA_PX = 0.25
-"""1-sigma disparity noise of SGBM on projected dots: the median error of `binpick bench --tuning`, 0.156 px, over 0.6745 as for
-a normal distribution, rounded up; one number for all pixels, not calibrated per pixel."""
 AGREEMENT = 12
 """Left and right agree within this, 1/16 px at half resolution: 1.5 px, OpenCV's default, at full resolution."""
 EDGE_RADIUS = 1
-"""Half-resolution pixels around a depth edge that lose confidence; OpenCV's own choice cost a tenth of the part pixels here."""
-TEXTURE_PX = 7
-LEAST_CONTRAST = 4
-"""Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
-JUMP_PX = 2.0
-"""A disparity step between neighbours above this is a depth edge."""
+"""Half-resolution pixels around a depth edge that lose confidence."""
+UNMATCHED = -SCALE
 
 
-def measure(matched: Matched, rectified: Rectified, settings: StereoSettings) -> Depth:
-    """The depth of the window's pixels.
+def confirm(found: Disparity, rectified: Rectified, settings: StereoSettings, guide: Image | None = None,
+            ) -> tuple[UInt8[np.ndarray, "window_h window_w"], Float32[np.ndarray, "window_h window_w"]]:
+    """Confidence (0 to 255) and the smoothed map (px, relative to the window's smallest) of the window's pixels.
 
-    A pixel is measured when its surroundings have texture, SGBM matched it, the WLS filter's left-right confidence reaches
-    `min_confidence`, and it is neither within `edge_px` of a depth edge nor in a speckle. OpenCV's filter wants the right
-    disparity negated, which its right matcher already delivers (opencv_contrib#2974).
+    `found` is the left view's disparity on the whole grid, margin included; `guide` the left image without the pattern. The
+    right view only says yes or no within 1.5 px, so it is matched at half resolution, an eighth of the work for the same
+    verdicts. The filter wants the right disparity negated (opencv_contrib#2974); the smoothed map ramps across depth edges:
+    it is never evidence.
     """
-    wls = cv2.ximgproc.createDisparityWLSFilter(matched.half_matcher)
+    window = rectified.window
+    half = pyramid.shrink(rectified)
+    right = _right(half, rectified, settings)
+    wls = cv2.ximgproc.createDisparityWLSFilterGeneric(use_confidence=True)
     wls.setLambda(settings.wls_lambda)
     wls.setSigmaColor(settings.wls_sigma_color)
     wls.setLRCthresh(AGREEMENT)
     wls.setDepthDiscontinuityRadius(EDGE_RADIUS)
-    smooth = wls.filter(matched.half_left, matched.half_guide, disparity_map_right=matched.half_right)
-    rows, cols = matched.left.shape
-    margin = rectified.margin
-    confidence = cv2.resize(wls.getConfidenceMap(), (cols, rows), interpolation=cv2.INTER_LINEAR)[:, margin:].astype(np.uint8)
-    filled = cv2.resize(smooth.astype(np.float32) * np.float32(2 / SCALE), (cols, rows),
-                        interpolation=cv2.INTER_LINEAR)[:, margin:]
-    raw = np.ascontiguousarray(matched.left[:, margin:])
-    measured = gate(raw, settings) & (confidence >= settings.min_confidence) & _textured(rectified.left[:, margin:])
-    disparity = raw.astype(np.float32) / SCALE + rectified.window.min_disparity
-    disparity[~measured] = np.nan
-    sigma_px = np.where(measured, np.float32(SGBM_SIGMA_PX), np.float32(np.nan))
-    return Depth(disparity=frozen(disparity), filled=frozen(filled + np.float32(rectified.window.min_disparity)),
-                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(sigma_px))
+    inside = (half.margin, 0, half.window.width, half.window.height)
+    smooth = wls.filter(_fixed(pyramid.coarse(found, window)), half.left if guide is None else pyramid.guide(guide, window),
+                        disparity_map_right=-_fixed(right), ROI=inside)
+    filled = np.asarray(smooth, np.float32) * np.float32(2 / SCALE)
+    confidence, filled = (_grown(field[:, half.margin:], (window.height, window.width))
+                          for field in (wls.getConfidenceMap(), filled))
+    return confidence.astype(np.uint8), filled
 
 
-def gate(raw: Int16[np.ndarray, "h w"], settings: StereoSettings) -> Mask:
-    """Which raw disparities stand on firm ground: matched, away from depth edges, not in a speckle."""
-    sound: Bool[np.ndarray, "h w"] = raw >= 0
-    if settings.speckle_px:
-        speckled = raw.copy()
-        cv2.filterSpeckles(speckled, -SCALE, settings.speckle_px, 2 * SCALE)
-        sound &= speckled >= 0
-    if settings.edge_px:
-        sound &= ~_near_jump(raw, sound, settings.edge_px)
-    return sound
+def _right(half: Rectified, rectified: Rectified, settings: StereoSettings) -> Float32[np.ndarray, "half_h half_w"]:
+    """The right view's disparity at half resolution, in its pixels."""
+    if isinstance(settings.matcher, Onnx):
+        whole = search.search_right(rectified.left, rectified.right, rectified.window.num_disparities, settings.matcher)
+        return pyramid.coarse(whole, rectified.window)
+    return search.search_right(half.left, half.right, half.window.num_disparities, settings.matcher)
 
 
-def _textured(image: Image) -> Mask:
-    """Where the image varies at all within a block: black and saturated areas match everything equally well."""
-    contrast = cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8))
-    return np.asarray(contrast >= LEAST_CONTRAST)
+def _fixed(disparity: Disparity) -> np.ndarray:
+    """As OpenCV writes disparities: 1/16 px, below zero where there is none."""
+    return np.where(np.isfinite(disparity), disparity * SCALE, UNMATCHED).astype(np.int16)
 
 
-def _near_jump(raw: Int16[np.ndarray, "h w"], sound: Mask, edge_px: int) -> Mask:
-    """Pixels within edge_px of a disparity step; holes are no steps."""
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    highest = cv2.dilate(np.where(sound, raw, np.int16(-32768)), kernel)
-    lowest = cv2.erode(np.where(sound, raw, np.int16(32767)), kernel)
-    jump = (highest.astype(np.int32) - lowest > JUMP_PX * SCALE).astype(np.uint8)
-    if edge_px > 1:
-        jump = cv2.dilate(jump, np.ones((2 * edge_px - 1, 2 * edge_px - 1), dtype=np.uint8))
-    return np.asarray(jump > 0)
-
+def _grown(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """From half to full resolution."""
+    rows, cols = field.shape
+    large = cv2.resize(field, (2 * cols, 2 * rows), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(large[:shape[0], :shape[1]])

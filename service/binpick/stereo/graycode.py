@@ -19,7 +19,7 @@ from binpick.data import (
     frozen,
 )
 from binpick.stereo import direct
-from binpick.stereo.match import SCALE
+from binpick.stereo.search import SCALE
 
 LEAST_CONTRAST = 8
 """Grey levels between white and black from which a pixel is read; fitted on the exam's steel, tuning seeds."""

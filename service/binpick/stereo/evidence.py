@@ -1,0 +1,100 @@
+"""What speaks for and against each match: is it seen in both images, does another surface explain it better, do planes fit."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from binpick.data import Disparity, Image, Rectified
+from binpick.stereo.refine import Refined, mean_of_four
+
+Field = Float32[np.ndarray, "h w"]
+NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
+"""Squared grey levels of the difference of two pixels: twice a read noise of 2, and shot noise of the brightness."""
+MOST = 5.0
+"""Differences between the images count up to so many sigma of noise: beyond, something else is seen."""
+NEAR_PX, AROUND_PX = 3, 5
+BLOCK_CELLS, WIDE_CELLS = 3, 5
+"""Sides of the squares that are looked at, in pixels and in cells of 2x2 px."""
+TWO_SURFACES_PX = 1.5
+"""Disparities that differ by more within 5x5 px are two hypotheses for the pixels between them."""
+MOST_JUMP_PX = 6.0
+"""No jump is more of a jump than this one; 12 px or its root told less on the tuning seeds."""
+OF_PIXELS = ("rival", "spread", "spread_near", "departure", "mismatch")
+OF_CELLS = ("misfit", "slope", "bend", "texture", "holes", "unconfirmed", "bright")
+"""The planes of `Evidence`, in their order; what changes slowly is kept for cells of 2x2 px.
+
+rival: how much better (sigma) the other surface within 5x5 px explains the 3x3 px around, 0 where there is none. spread: range
+of disparities in 5x5 and 3x3. departure, misfit (log), slope, bend: of the plane (see `refine`). mismatch: difference of the
+images at this disparity, 3x3. texture: log of the image's squared slope, 6x6. holes: share of the 10x10 px without a match.
+unconfirmed: what the filter's confidence leaves. bright: mean grey level / 100, 6x6: in shadow little is sure.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """The measures of every pixel of the window; those of unmatched pixels mean nothing. `two` tells where surfaces compete."""
+
+    pixels: Float32[np.ndarray, "n h w"]
+    cells: Float32[np.ndarray, "m h2 w2"]
+    two: Bool[np.ndarray, "h w"]
+
+
+def gather(matched: Disparity, refined: Refined, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified) -> Evidence:
+    """The evidence on matched disparities, px relative to the window's smallest, NaN: not matched."""
+    known = np.isfinite(matched)
+    left = rectified.left[:, rectified.margin:]
+    pixels = np.empty((len(OF_PIXELS), *matched.shape), np.float32)
+    put = dict(zip(OF_PIXELS, pixels, strict=True))
+    flat, deep = (np.where(known, matched, np.float32(value)) for value in (0, 4096))
+    high, low = _extremes(flat, deep, AROUND_PX)
+    two = np.asarray((high - low > TWO_SURFACES_PX) & known)
+    np.clip(high - low, 0, MOST_JUMP_PX, out=put["spread"])
+    near_high, near_low = _extremes(flat, deep, NEAR_PX)
+    np.clip(near_high - near_low, 0, MOST_JUMP_PX, out=put["spread_near"])
+    compare = _Comparison(left, rectified.right, rectified.margin)
+    cv2.blur(compare.at(flat), (NEAR_PX, NEAR_PX), dst=put["mismatch"])
+    difference = cv2.blur(compare.at(high) - compare.at(low), (NEAR_PX, NEAR_PX))
+    np.multiply(np.where(2 * matched > high + low, difference, -difference), two, out=put["rival"])
+    np.fmin(refined.departure, 2, out=put["departure"])
+    return Evidence(pixels, _of_cells(left, known, refined, confidence), two)
+
+
+def _of_cells(left: Image, known: Bool[np.ndarray, "h w"], refined: Refined, confidence: UInt8[np.ndarray, "h w"],
+              ) -> Float32[np.ndarray, "m h2 w2"]:
+    rows, cols = refined.misfit.shape
+    cells = np.empty((len(OF_CELLS), rows, cols), np.float32)
+    put = dict(zip(OF_CELLS, cells, strict=True))
+    put["misfit"][:], put["slope"][:], put["bend"][:] = refined.misfit, refined.slope, refined.bend
+    slope = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+    np.log(1 + cv2.blur(mean_of_four(slope * slope), (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
+    missing = 1 - mean_of_four(known.astype(np.float32))
+    cv2.blur(missing, (WIDE_CELLS, WIDE_CELLS), dst=put["holes"])
+    np.multiply(255 - confidence[:2 * rows:2, :2 * cols:2], np.float32(1 / 255), out=put["unconfirmed"])
+    np.multiply(cv2.blur(mean_of_four(left), (BLOCK_CELLS, BLOCK_CELLS)), np.float32(1 / 100), out=put["bright"])
+    return cells
+
+
+def _extremes(flat: Field, deep: Field, size: int) -> tuple[Field, Field]:
+    """Largest and smallest disparity around; 0 where nothing is matched around. Without a match `flat` is 0, `deep` a lot."""
+    kernel = np.ones((size, size), np.uint8)
+    high = np.asarray(cv2.dilate(flat, kernel), np.float32)
+    return high, np.asarray(cv2.min(cv2.erode(deep, kernel), high), np.float32)
+
+
+class _Comparison:
+    """How unlike the two images are at a disparity, in sigmas of noise, at most MOST."""
+
+    def __init__(self, left: Image, right: Image, margin: int) -> None:
+        rows, cols = left.shape
+        self._left, self._right = left, right
+        self._u = np.arange(margin, margin + cols, dtype=np.float32)
+        self._v = np.repeat(np.arange(rows, dtype=np.float32)[:, None], cols, axis=1)
+        table = 1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))
+        self._per_sigma = cv2.LUT(left, table.astype(np.float32))
+
+    def at(self, disparity: Field) -> Field:
+        seen = cv2.remap(self._right, self._u - disparity, self._v, cv2.INTER_LINEAR)
+        unlike = cv2.multiply(cv2.absdiff(self._left, seen), self._per_sigma, dtype=cv2.CV_32F)
+        return np.asarray(cv2.min(unlike, MOST), np.float32)
