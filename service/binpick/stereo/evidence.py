@@ -86,7 +86,7 @@ def _extremes(flat: Field, deep: Field, size: int) -> tuple[Field, Field]:
 class _Comparison:
     """How unlike the two images are at a disparity, in sigmas of noise, at most MOST."""
 
-    def __init__(self, left: Image, right: Image, margin: int) -> None:
+    def __init__(self, left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int) -> None:
         rows, cols = left.shape
         self._left, self._right = left, right
         self._u = np.arange(margin, margin + cols, dtype=np.float32)
