@@ -78,10 +78,10 @@ def test_a_calib_without_range_is_refused(tmp_path):
 
 
 def test_five_paths_change_the_semi_global_matcher_alone():
-    settings = StereoSettings(matcher=Sgbm(block_px=7), min_confidence=3)
+    settings = StereoSettings(matcher=Sgbm(block_px=7), wls_lambda=3000.0)
     changed = methods.five_paths(settings)
     assert changed.matcher == Sgbm(block_px=7, mode="sgbm")
-    assert changed.min_confidence == 3
+    assert changed.wls_lambda == 3000.0
     assert methods.five_paths(StereoSettings(matcher=Hybrid())).matcher == Hybrid()
 
 

@@ -135,7 +135,7 @@ def text(full: weights.Model, half: weights.Model) -> str:
         for which, laws in (("alone", model.alone), ("between", model.between)):
             lines.append(f"    {which}=Laws(\n")
             for kind, law in (("wrong", laws.wrong), ("sigma", laws.sigma)):
-                lines.append(f"        {kind}=Law({law.constant}, {law.pixels}, {law.cells}),\n")
+                lines.append(f"        {kind}=Law({law.constant}, {law.pixels},\n                  {law.cells}),\n")
             lines.append("    ),\n")
         lines.append(")\n")
     return "".join(lines)
