@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from binpick.data import Depth, Rectified
+from binpick.data import BLACK_PATTERN, FIRST_GRAY_PATTERN, Depth, Rectified
 from binpick.lab import exam, methods
 from binpick.lab.exam import Paper
 from binpick.lab.regions import Regions, regions
@@ -39,13 +39,11 @@ class Series:
     shots: tuple[Shot, ...] = ()
 
 
-SHORT_US = 1200.0
-"""A fifth of the recipe's exposure: what glares at the long one shows its pattern at this one."""
+GRAY_CODE = (Shot(), *(Shot(pattern=pattern) for pattern in range(FIRST_GRAY_PATTERN, BLACK_PATTERN + 1)))
+"""Dots for the other methods, and what a programmable projector shows for ours."""
 SERIES = (
     Series("mixed_A", "A"), Series("mixed_B", "B"), Series("metal_A", "A", kinds="metal"),
-    Series("metal_shots_A", "A", kinds="metal",
-           shots=tuple(Shot(pattern=pattern, exposure_us=exposure) for pattern in (0, 1) for exposure in (None, SHORT_US))),
-    Series("no_projector_A", "A", projector=False))
+    Series("metal_gray_A", "A", kinds="metal", shots=GRAY_CODE), Series("no_projector_A", "A", projector=False))
 """In the order of the tables."""
 
 
@@ -102,10 +100,13 @@ class _Watch:
 
 
 def sit(series: Series, seeds: Iterable[int], repeats: int) -> Iterator[Sheet]:
-    """One scene after the other; `repeats` timed runs of plain SGBM and of each preset, taking turns, one of the others."""
+    """One scene after the other; `repeats` timed runs of plain SGBM and of each preset, taking turns, one of the others.
+
+    A cycle of many shots takes seconds and is timed once.
+    """
     for seed in seeds:
         paper = exam.paper(series.world, seed, kinds=series.kinds, projector=series.projector, shots=series.shots)
-        yield answer(series, seed, paper, repeats)
+        yield answer(series, seed, paper, 1 if series.shots else repeats)
 
 
 def answer(series: Series, seed: int, paper: Paper, repeats: int) -> Sheet:

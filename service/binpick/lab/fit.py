@@ -60,7 +60,7 @@ def _lesson(pair: Rectified, settings: StereoSettings, reach: refine.Reach, targ
     if isinstance(matcher, Hybrid):
         matcher = Sgbm.model_validate(matcher.model_dump(exclude={"kind"}))
     whole = search.search(pair.left, pair.right, pair.window.num_disparities, matcher)
-    confidence, _ = filter.confirm(whole, pair, settings.model_copy(update={"matcher": matcher}))
+    confidence, _ = filter.confirm(whole, pair, matcher, settings)
     found = np.ascontiguousarray(whole[:, pair.margin:])
     refined = refine.refine(found, pair, reach)
     seen = evidence.gather(found, refined, confidence, pair)

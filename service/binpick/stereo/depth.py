@@ -19,7 +19,7 @@ STRIP_ROWS, OVERLAP_ROWS = 248, 24
 """Rows that are refined and judged at a time, and what they see beyond: the widest window reaches 17 rows. Both are even, as
 cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same whoever computes it."""
 TEXTURE_PX = 7
-LEAST_CONTRAST = 4
+LEAST_CONTRAST = 2
 """Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
 
 
@@ -29,12 +29,13 @@ def measure(rectified: Rectified, settings: StereoSettings, guide: Image | None 
     `guide` is the left image without the pattern, for the map for people; the left image itself when there is none.
     Raises ImageError and InputError as `search.search`.
     """
-    if isinstance(settings.matcher, Hybrid):
-        coarse = settings.model_copy(update={"matcher": Sgbm.model_validate(settings.matcher.model_dump(exclude={"kind"})),
-                                             "speckle_px": settings.speckle_px // 4})
+    matcher = settings.matcher
+    if isinstance(matcher, Hybrid):
+        sgbm = Sgbm.model_validate(matcher.model_dump(exclude={"kind"}))
+        fewer = settings.model_copy(update={"speckle_px": settings.speckle_px // 4})
         small = None if guide is None else pyramid.guide(guide, rectified.window)
-        return pyramid.double(_measure(pyramid.shrink(rectified), coarse, small, HALF), rectified.window)
-    return _measure(rectified, settings, guide, FULL)
+        return pyramid.double(_measure(pyramid.shrink(rectified), sgbm, fewer, small, HALF), rectified.window)
+    return _measure(rectified, matcher, settings, guide, FULL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +49,12 @@ class _Scale:
 FULL, HALF = _Scale(refine.FULL, weights.FULL), _Scale(refine.HALF, weights.HALF)
 
 
-def _measure(rectified: Rectified, settings: StereoSettings, guide: Image | None, scale: _Scale) -> Depth:
+def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettings, guide: Image | None, scale: _Scale,
+             ) -> Depth:
     seen = replace(rectified, left=prefilter.prefilter(rectified.left, settings.prefilter),
                    right=prefilter.prefilter(rectified.right, settings.prefilter))
-    whole = search.search(seen.left, seen.right, seen.window.num_disparities, settings.matcher)
-    confidence, filled = filter.confirm(whole, seen, settings, guide)
+    whole = search.search(seen.left, seen.right, seen.window.num_disparities, matcher)
+    confidence, filled = filter.confirm(whole, seen, matcher, settings, guide)
     found = np.ascontiguousarray(whole[:, rectified.margin:])
     disparity, judged = _refined(found, confidence, rectified, scale)
     sound = trust.measured(disparity, judged, settings.max_risk, settings.speckle_px) & _textured(rectified)
