@@ -8,7 +8,7 @@ from binpick.data import Disparity, Image, Rectified
 from binpick.settings import StereoSettings
 from binpick.settings.stereo import Onnx
 from binpick.stereo import pyramid, search
-from binpick.stereo.search import SCALE
+from binpick.stereo.search import SCALE, Plain
 
 AGREEMENT = 12
 """Left and right agree within this, 1/16 px at half resolution: 1.5 px, OpenCV's default, at full resolution."""
@@ -17,18 +17,18 @@ EDGE_RADIUS = 1
 UNMATCHED = -SCALE
 
 
-def confirm(found: Disparity, rectified: Rectified, settings: StereoSettings, guide: Image | None = None,
+def confirm(found: Disparity, rectified: Rectified, matcher: Plain, settings: StereoSettings, guide: Image | None = None,
             ) -> tuple[UInt8[np.ndarray, "window_h window_w"], Float32[np.ndarray, "window_h window_w"]]:
     """Confidence (0 to 255) and the smoothed map (px, relative to the window's smallest) of the window's pixels.
 
-    `found` is the left view's disparity on the whole grid, margin included; `guide` the left image without the pattern. The
-    right view only says yes or no within 1.5 px, so it is matched at half resolution, an eighth of the work for the same
-    verdicts. The filter wants the right disparity negated (opencv_contrib#2974); the smoothed map ramps across depth edges:
-    it is never evidence.
+    `found` is the left view's disparity on the whole grid, margin included, as `matcher` found it; `guide` the left image
+    without the pattern. The right view only says yes or no within 1.5 px, so it is matched at half resolution, an eighth of the
+    work for the same verdicts. The filter wants the right disparity negated (opencv_contrib#2974); the smoothed map ramps
+    across depth edges: it is never evidence.
     """
     window = rectified.window
     half = pyramid.shrink(rectified)
-    right = _right(half, rectified, settings)
+    right = _right(half, rectified, matcher)
     wls = cv2.ximgproc.createDisparityWLSFilterGeneric(use_confidence=True)
     wls.setLambda(settings.wls_lambda)
     wls.setSigmaColor(settings.wls_sigma_color)
@@ -43,12 +43,12 @@ def confirm(found: Disparity, rectified: Rectified, settings: StereoSettings, gu
     return confidence.astype(np.uint8), filled
 
 
-def _right(half: Rectified, rectified: Rectified, settings: StereoSettings) -> Float32[np.ndarray, "half_h half_w"]:
+def _right(half: Rectified, rectified: Rectified, matcher: Plain) -> Float32[np.ndarray, "half_h half_w"]:
     """The right view's disparity at half resolution, in its pixels."""
-    if isinstance(settings.matcher, Onnx):
-        whole = search.search_right(rectified.left, rectified.right, rectified.window.num_disparities, settings.matcher)
+    if isinstance(matcher, Onnx):
+        whole = search.search_right(rectified.left, rectified.right, rectified.window.num_disparities, matcher)
         return pyramid.coarse(whole, rectified.window)
-    return search.search_right(half.left, half.right, half.window.num_disparities, settings.matcher)
+    return search.search_right(half.left, half.right, half.window.num_disparities, matcher)
 
 
 def _fixed(disparity: Disparity) -> np.ndarray:

@@ -1,12 +1,14 @@
 """The raw search: one function from a pair to a view's disparity, whichever the matcher."""
 
+from typing import TypeAlias
+
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int16, UInt8
+from jaxtyping import Int16
 
 from binpick.data import Disparity, Image
 from binpick.errors import ImageError, InputError
-from binpick.settings.stereo import Bm, Hybrid, Matcher, Onnx, Sgbm
+from binpick.settings.stereo import Bm, Onnx, Sgbm
 from binpick.stereo import network
 
 SCALE = 16
@@ -27,28 +29,26 @@ MODES = {
     "hh": cv2.STEREO_SGBM_MODE_HH,
     "hh4": cv2.STEREO_SGBM_MODE_HH4,
 }
-Half = UInt8[np.ndarray, "half_h half_w"]
+Plain: TypeAlias = Sgbm | Bm | Onnx
+"""What searches a pair as it is; `settings.Hybrid` is Sgbm on a shrunk one (see `depth`)."""
 
 
-def search(left: Image, right: Image, num_disparities: int, matcher: Matcher) -> Disparity:
+def search(left: Image, right: Image, num_disparities: int, matcher: Plain) -> Disparity:
     """The left view's disparity, px, as found: NaN where nothing was, no other judgement yet.
 
     Both images share rows and a left margin of num_disparities columns, and `right` is already shifted by the smallest
     disparity (`data.Rectified`), so that what is found lies in [0, num_disparities) and never near the end of OpenCV's int16.
     The result has the images' shape; its margin means nothing. StereoBM measures nothing within half a block of the images'
-    borders. All but networks drop what differs by more than 1 px (hybrid: 2 px) on the way back from the right.
+    borders. All but networks drop what differs by more than 1 px on the way back from the right.
     Raises ImageError on a window too small for the block, InputError on a range or a model that cannot be used.
     """
     _check(left, num_disparities, matcher)
     if isinstance(matcher, Onnx):
         return _seen(network.disparity(left, right, matcher.model), num_disparities)
-    if isinstance(matcher, Hybrid):
-        halves = _halves(left, right, num_disparities)
-        return _double(_left_pass(*halves, _engine(matcher, _half(num_disparities))), left.shape, num_disparities)
     return _left_pass(left, right, _engine(matcher, num_disparities))
 
 
-def search_right(left: Image, right: Image, num_disparities: int, matcher: Matcher) -> Disparity:
+def search_right(left: Image, right: Image, num_disparities: int, matcher: Plain) -> Disparity:
     """The right view's disparity on the right view's grid, px, positive; NaN where nothing was found.
 
     A right pixel x shows what the left view has at x + disparity. OpenCV's right matcher searches -num_disparities + 1 to 0
@@ -60,13 +60,10 @@ def search_right(left: Image, right: Image, num_disparities: int, matcher: Match
     if isinstance(matcher, Onnx):
         mirrored = network.disparity(_mirror(right), _mirror(left), matcher.model)
         return np.ascontiguousarray(_seen(mirrored, num_disparities)[:, ::-1])
-    if isinstance(matcher, Hybrid):
-        halves = _halves(left, right, num_disparities)
-        return _double(_right_pass(*halves, _engine(matcher, _half(num_disparities))), left.shape, num_disparities)
     return _right_pass(left, right, _engine(matcher, num_disparities))
 
 
-def _engine(matcher: Sgbm | Hybrid | Bm, num_disparities: int) -> cv2.StereoMatcher:
+def _engine(matcher: Sgbm | Bm, num_disparities: int) -> cv2.StereoMatcher:
     if isinstance(matcher, Bm):
         engine = cv2.StereoBM.create(num_disparities, matcher.block_px)
         engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
@@ -78,7 +75,7 @@ def _engine(matcher: Sgbm | Hybrid | Bm, num_disparities: int) -> cv2.StereoMatc
     return cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=num_disparities, blockSize=matcher.block_px, P1=matcher.p1, P2=matcher.p2,
         disp12MaxDiff=1, preFilterCap=PREFILTER_CAP, uniquenessRatio=matcher.uniqueness_percent, speckleWindowSize=0,
-        speckleRange=0, mode=MODES[matcher.mode if isinstance(matcher, Sgbm) else "3way"])
+        speckleRange=0, mode=MODES[matcher.mode])
 
 
 def _left_pass(left: Image, right: Image, engine: cv2.StereoMatcher) -> Disparity:
@@ -110,44 +107,11 @@ def _seen(found: Disparity, num_disparities: int) -> Disparity:
     return np.where(inside, found, np.float32(np.nan))
 
 
-def _half(num_disparities: int) -> int:
-    """Disparities of the pair shrunk by two, in whole steps again."""
-    return STEP * ((num_disparities + 2 * STEP - 1) // (2 * STEP))
-
-
-def _padding(num_disparities: int) -> int:
-    """Columns by which the margin of the shrunk pair is wider, at full resolution: 0 or 16."""
-    return 2 * _half(num_disparities) - num_disparities
-
-
-def _halves(left: Image, right: Image, num_disparities: int) -> tuple[Half, Half]:
-    """Both images shrunk by two.
-
-    Odd sides are padded to even ones, or OpenCV would shrink by a little more than two and stretch every disparity; the
-    padding on the left makes the margin as wide as the coarse range, which is rounded up to whole steps.
-    """
-    rows, cols = left.shape
-    even = [cv2.copyMakeBorder(image, 0, rows % 2, _padding(num_disparities), cols % 2, cv2.BORDER_REPLICATE)
-            for image in (left, right)]
-    size = even[0].shape[1] // 2, even[0].shape[0] // 2
-    coarse = [np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for image in even]
-    return coarse[0], coarse[1]
-
-
-def _double(coarse: Float32[np.ndarray, "half_h half_w"], shape: tuple[int, int], num_disparities: int) -> Disparity:
-    """Twice the disparity of the coarse pixel that covers each pixel: no value in between invents a surface across a jump."""
-    (rows, cols), (height, width), pad = coarse.shape, shape, _padding(num_disparities)
-    fine = cv2.resize(2 * coarse, (2 * cols, 2 * rows), interpolation=cv2.INTER_NEAREST)
-    fine = np.array(fine[:height, pad:pad + width], dtype=np.float32, order="C")
-    fine[fine >= num_disparities] = np.nan
-    return fine
-
-
 def _mirror(image: Image) -> Image:
     return np.ascontiguousarray(image[:, ::-1])
 
 
-def _check(left: Image, num_disparities: int, matcher: Matcher) -> None:
+def _check(left: Image, num_disparities: int, matcher: Plain) -> None:
     """What OpenCV would answer with rubbish instead of an error (each case is a test)."""
     if num_disparities < STEP or num_disparities % STEP or num_disparities > MOST_DISPARITIES:
         raise InputError(f"{num_disparities} disparities cannot be searched: it must be a multiple of {STEP} up to "
@@ -155,10 +119,9 @@ def _check(left: Image, num_disparities: int, matcher: Matcher) -> None:
     if isinstance(matcher, Onnx):
         return
     rows, cols = left.shape
-    least = matcher.block_px * (2 if isinstance(matcher, Hybrid) else 1)
-    if cols - num_disparities <= least or rows < least:
+    if cols - num_disparities <= matcher.block_px or rows < matcher.block_px:
         raise ImageError(f"a window of {cols - num_disparities}x{rows} px is too small for a matched block of "
-                         f"{least} px: use a smaller block_px or a larger window")
+                         f"{matcher.block_px} px: use a smaller block_px or a larger window")
     needed = BYTES_PER_COST * rows * cols * num_disparities
     if isinstance(matcher, Sgbm) and matcher.mode in ("hh", "hh4") and needed > MOST_BYTES:
         raise InputError(f"mode {matcher.mode} would need {needed / 2**30:.1f} GiB here: use mode 3way or sgbm")
