@@ -19,7 +19,7 @@ STRIP_ROWS, OVERLAP_ROWS = 248, 24
 """Rows that are refined and judged at a time, and what they see beyond: the widest window reaches 17 rows. Both are even, as
 cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same whoever computes it."""
 TEXTURE_PX = 7
-LEAST_CONTRAST = 4
+LEAST_CONTRAST = 2
 """Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
 
 
