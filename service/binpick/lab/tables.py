@@ -9,7 +9,7 @@ from binpick.lab import methods
 
 TITLES = {
     "mixed_A": "world A, mixed parts", "mixed_B": "world B, mixed parts", "metal_A": "world A, dark shiny steel",
-    "metal_shots_A": "world A, dark shiny steel, ours from two patterns in two exposures",
+    "metal_gray_A": "world A, dark shiny steel, ours by Gray code (43 shots)",
     "no_projector_A": "world A, mixed parts, projector off",
 }
 NAMES = {
