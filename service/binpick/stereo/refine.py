@@ -78,7 +78,8 @@ def refine(matched: Disparity, rectified: Rectified, reach: Reach) -> Refined:
     departure = np.abs(plane - matched)
     with np.errstate(invalid="ignore"):
         disparity = np.where(departure < TRUSTED_PX, plane, matched)
-    steepness = np.minimum(cv2.magnitude(slope_u, slope_v) / 2, np.float32(1))
+    # not cv2.magnitude: its last bit depends on where in memory the arrays lie
+    steepness = np.minimum(np.sqrt(slope_u * slope_u + slope_v * slope_v) / 2, np.float32(1))
     return Refined(disparity, departure, np.log(np.minimum(misfit, 10) + np.float32(1e-4)), steepness,
                    _bend(slope_u, slope_v, reach.radius))
 
