@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,8 +12,7 @@ from binpick.data import Depth, Disparity, Image, Light, Mask, Rectified, frozen
 from binpick.settings import StereoSettings
 from binpick.settings.stereo import Hybrid, Sgbm
 from binpick.stereo import evidence, filter, graycode, prefilter, pyramid, refine, search, shots, trust, weights
-from binpick.stereo.refine import Reach
-from binpick.stereo.trust import Trust
+from binpick.stereo.refine import Reach, Refined
 from binpick.stereo.weights import Model
 
 STRIP_ROWS, OVERLAP_ROWS = 248, 24
@@ -54,13 +54,19 @@ def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettin
     seen = replace(rectified, left=prefilter.prefilter(rectified.left, settings.prefilter),
                    right=prefilter.prefilter(rectified.right, settings.prefilter))
     whole = search.search(seen.left, seen.right, seen.window.num_disparities, matcher)
-    confidence, filled = filter.confirm(whole, seen, matcher, settings, guide)
     found = np.ascontiguousarray(whole[:, rectified.margin:])
-    disparity, judged = _refined(found, confidence, rectified, scale)
-    sound = trust.measured(disparity, judged, settings.max_risk, settings.speckle_px) & _textured(rectified)
+    strips = _strips(found.shape[0])
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-strip") as pool:
+        # planes need no confidence: they are fitted beside the right view's search
+        confirming = pool.submit(filter.confirm, whole, seen, matcher, settings, guide)
+        refined = list(pool.map(lambda strip: refine.refine(found[strip.seen], strip.of(rectified), scale.reach), strips))
+        confidence, filled = confirming.result()
+        judge = partial(_judged, found, confidence, rectified, scale.model, settings.max_risk)
+        disparity, sound, sigma_px = (np.concatenate(rows) for rows in zip(*pool.map(judge, strips, refined), strict=True))
+    measured = sound & ~trust.speckled(disparity, sound, settings.speckle_px)
     low, nan = np.float32(rectified.window.min_disparity), np.float32(np.nan)
-    return Depth(disparity=frozen(np.where(sound, disparity + low, nan)), filled=frozen(filled + low),
-                 confidence=frozen(confidence), measured=frozen(sound), sigma_px=frozen(np.where(sound, judged.sigma_px, nan)))
+    return Depth(disparity=frozen(np.where(measured, disparity + low, nan)), filled=frozen(filled + low),
+                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(np.where(measured, sigma_px, nan)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,35 +78,36 @@ class _Strip:
     bottom: int
     last: int
 
+    @property
+    def seen(self) -> slice:
+        """All its rows."""
+        return slice(self.first, self.last)
+
+    def of(self, rectified: Rectified) -> Rectified:
+        """Those of both images."""
+        return replace(rectified, left=rectified.left[self.seen], right=rectified.right[self.seen])
+
     def inner(self, field: np.ndarray) -> np.ndarray:
         """Without the overlap."""
         return field[self.top - self.first:self.bottom - self.first]
 
 
-def _refined(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified, scale: _Scale,
-             ) -> tuple[Disparity, Trust]:
-    """The refined disparity and what to think of it, strip by strip on as many threads as OpenCV is given."""
-    rows = found.shape[0]
-    tops = range(0, rows, STRIP_ROWS)
-    strips = [_Strip(max(0, top - OVERLAP_ROWS), top, min(top + STRIP_ROWS, rows), min(top + STRIP_ROWS + OVERLAP_ROWS, rows))
-              for top in tops]
-
-    def work(strip: _Strip) -> tuple[np.ndarray, ...]:
-        part = slice(strip.first, strip.last)
-        pair = replace(rectified, left=rectified.left[part], right=rectified.right[part])
-        refined = refine.refine(found[part], pair, scale.reach)
-        judged = trust.judge(evidence.gather(found[part], refined, confidence[part], pair), scale.model)
-        return tuple(strip.inner(field) for field in (refined.disparity, judged.odds, judged.sigma_px))
-
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-strip") as pool:
-        done = list(pool.map(work, strips))
-    disparity, odds, sigma_px = (np.concatenate(fields) for fields in zip(*done, strict=True))
-    return disparity, Trust(odds, sigma_px)
+def _strips(rows: int) -> list[_Strip]:
+    return [_Strip(max(0, top - OVERLAP_ROWS), top, min(top + STRIP_ROWS, rows), min(top + STRIP_ROWS + OVERLAP_ROWS, rows))
+            for top in range(0, rows, STRIP_ROWS)]
 
 
-def _textured(rectified: Rectified) -> Mask:
+def _judged(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified, model: Model, max_risk: float,
+            strip: _Strip, refined: Refined) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Disparity, whether to believe it, and its sigma, of a strip."""
+    pair = strip.of(rectified)
+    judged = trust.judge(evidence.gather(found[strip.seen], refined, confidence[strip.seen], pair), model)
+    sound = trust.believed(refined.disparity, judged, max_risk) & _textured(pair.left[:, pair.margin:])
+    return strip.inner(refined.disparity), strip.inner(sound), strip.inner(judged.sigma_px)
+
+
+def _textured(image: Image) -> Mask:
     """Where the image varies at all within a block: black and saturated areas match everything equally well."""
-    image = rectified.left[:, rectified.margin:]
     contrast = cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8))
     return np.asarray(contrast >= LEAST_CONTRAST)
 

@@ -58,14 +58,18 @@ def _sum(planes: Float32[np.ndarray, "n h w"], weights: tuple[float, ...], total
     return total
 
 
-def measured(disparity: Disparity, trust: Trust, max_risk: float, speckle_px: int) -> Mask:
-    """Matched, unlikely to be wrong, and no speckle: islands of fewer pixels within 2 px of disparity are dropped."""
-    sound = np.isfinite(disparity) & (trust.odds <= _log_odds(max_risk))
-    if speckle_px:
-        fixed = np.where(sound, disparity * 16, -16).astype(np.int16)
-        cv2.filterSpeckles(fixed, -16, speckle_px, 32)
-        sound &= fixed >= 0
-    return np.asarray(sound)
+def believed(disparity: Disparity, trust: Trust, max_risk: float) -> Mask:
+    """Matched, and unlikely to be wrong."""
+    return np.asarray(np.isfinite(disparity) & (trust.odds <= _log_odds(max_risk)))
+
+
+def speckled(disparity: Disparity, sound: Mask, speckle_px: int) -> Mask:
+    """The sound pixels in islands of fewer than `speckle_px`; within an island neighbours differ by 2 px at most."""
+    if not speckle_px:
+        return np.zeros(sound.shape, dtype=bool)
+    fixed = np.where(sound, disparity * 16, -16).astype(np.int16)
+    cv2.filterSpeckles(fixed, -16, speckle_px, 32)
+    return np.asarray(sound & (fixed < 0))
 
 
 def _log_odds(risk: float) -> float:
