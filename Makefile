@@ -7,7 +7,7 @@ SYSTEM := python3-venv python3-gi gir1.2-aravis-0.8 libgl1 libegl1 libx11-6 libu
 TEST_SYSTEM := chromium mbpoll
 ARGS ?=
 
-.PHONY: help demo test check fast bench lint schema install install-test clean
+.PHONY: help demo test check fast bench fit lint schema install install-test clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -44,6 +44,9 @@ test: install-test lint  ## everything that CI runs
 
 bench: $(STAMP)  ## accuracy and speed against the textbook pipeline, on the frozen exam
 	$(BIN)/binpick bench $(ARGS)
+
+fit: $(STAMP)  ## fit anew what counts as measured, on the exam's tuning seeds (stereo/weights.py)
+	$(BIN)/python -m binpick.lab.fit
 
 schema: $(STAMP)  ## regenerate the generated files of deploy/ and the list of modules in DECISIONS
 	$(BIN)/binpick schema >deploy/cell.schema.json
