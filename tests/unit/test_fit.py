@@ -53,10 +53,9 @@ def lesson(count: int = 30_000) -> fit.Lesson:
 def test_a_fitted_model_tells_what_makes_errors_and_how_large_they_are() -> None:
     taught = lesson()
     model = fit.fit([taught])
-    for laws, some in ((model.alone, ~taught.two), (model.between, taught.two)):
-        assert laws.wrong.pixels[1] > 1
-        assert laws.sigma.pixels[1] == pytest.approx(1.0, abs=0.15)
-        assert laws.wrong.cells[-1] == laws.sigma.cells[-1] == 0, "what never changes tells nothing"
-        planes = taught.planes[some].astype(float)
-        sigma = np.exp(laws.sigma.constant + planes @ (*laws.sigma.pixels, *laws.sigma.cells))
-        assert (taught.error_px[some] < sigma).mean() == pytest.approx(fit.QUANTILE, abs=0.02)
+    wrong, sigma = model.alone.wrong, model.alone.sigma
+    assert wrong.pixels[1] > 1
+    assert sigma.pixels[1] == pytest.approx(1.0, abs=0.15)
+    assert wrong.cells[-1] == sigma.cells[-1] == 0, "what never changes tells nothing"
+    told = np.exp(sigma.constant + taught.planes[~taught.two].astype(float) @ (*sigma.pixels, *sigma.cells))
+    assert (taught.error_px[~taught.two] < told).mean() == pytest.approx(fit.QUANTILE, abs=0.02)

@@ -10,9 +10,10 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from binpick.data import Rectified, Window
 from binpick.errors import InputError
-from binpick.settings.stereo import Onnx
-from binpick.stereo import network
+from binpick.settings.stereo import Onnx, StereoSettings
+from binpick.stereo import depth, network
 from binpick.stereo.search import search, search_right
 
 SHIFTS = 32
@@ -187,3 +188,20 @@ def test_without_onnxruntime_the_extra_is_named(tmp_path, monkeypatch):
     onnx.save(block_matcher(), path)
     with pytest.raises(InputError, match=r"pip install 'binpick\[onnx\]'"):
         network.load(path)
+
+
+def test_what_a_network_finds_is_refined_and_judged_by_the_same_bits_on_one_thread_and_on_two(tmp_path):
+    left, right = planted(17, rows=80, cols=180)
+    pair = Rectified(left, right, Window(0, 0, 180 - SHIFTS, 80, 5, SHIFTS), SHIFTS, 1000.0, 0.1, 90.0, 40.0, np.eye(4))
+    settings = StereoSettings(matcher=Onnx(model=saved(block_matcher(), tmp_path)))
+    before, found = cv2.getNumThreads(), []
+    try:
+        for threads in (1, 2):
+            cv2.setNumThreads(threads)
+            found.append(depth.measure(pair, settings))
+    finally:
+        cv2.setNumThreads(before)
+    assert found[0].measured.mean() > 0.7
+    assert np.nanmedian(np.abs(found[0].disparity - 22)) < 0.02
+    for name in ("disparity", "measured", "confidence", "sigma_px"):
+        assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()

@@ -18,12 +18,12 @@ MOTORCYCLE = Path(__file__).parents[3] / "shared" / "data" / "middlebury_v3q" / 
 
 
 def planted(shift: float, rows: int = 120, cols: int = 200, seed: int = 1) -> Rectified:
-    """A random texture seen by both views, `shift` px apart beyond min_disparity 40."""
-    rng = np.random.default_rng(seed)
-    texture = cv2.GaussianBlur(rng.uniform(0, 255, (rows, cols + 200)).astype(np.float32), (0, 0), 1.0)
-    texture = 4 * (texture - texture.mean()) + 128
-    u, v = np.meshgrid(np.arange(cols + 64, dtype=np.float32), np.arange(rows, dtype=np.float32))
-    left, right = (np.clip(cv2.remap(texture, u + 50 + du, v, cv2.INTER_CUBIC), 0, 255).astype(np.uint8) for du in (0.0, shift))
+    """A random texture seen by both views, `shift` px (in quarters: nothing is interpolated) apart beyond min_disparity 40."""
+    noise = np.random.default_rng(seed).uniform(0, 255, (rows, 4 * (cols + 200))).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), sigmaX=6.0, sigmaY=1.5)
+    texture = 128 + 45 * (texture - texture.mean()) / texture.std()
+    left, right = (np.clip(np.rint(texture[:, begin:begin + 4 * (cols + 64):4]), 0, 255).astype(np.uint8)
+                   for begin in (200, 200 + round(4 * shift)))
     view = Window(0, 0, cols, rows, 40, 64)
     return Rectified(left=left, right=right, window=view, margin=64, focal_px=1000.0, baseline_m=0.1, cx_px=100.0, cy_px=60.0,
                      T_camera_rect=np.eye(4))
@@ -79,8 +79,8 @@ def test_a_planted_shift_is_measured(shift):
     pair = planted(shift)
     found = depth.measure(pair, PRESETS["quality"])
     assert found.measured.mean() > 0.85
-    # SGBM's pixel locking alone is worth 0.18 px; what is left is the interpolation of 8-bit images
-    assert np.nanmedian(np.abs(found.disparity - (40 + shift))) < 0.02
+    # SGBM's pixel locking alone is worth 0.12 px at a quarter
+    assert np.nanmedian(np.abs(found.disparity - (40 + shift))) < 0.03
     assert np.isnan(found.disparity[~found.measured]).all()
     assert np.median(np.abs(found.filled - (40 + shift))) < 0.3
     xyz = cloud.reproject(found, pair).xyz
@@ -122,9 +122,9 @@ def test_motorcycle_from_the_command_line(tmp_path):
     judged = (cv2.imread(str(MOTORCYCLE / "mask0nocc.png"), cv2.IMREAD_GRAYSCALE) == 255) & np.isfinite(truth)
     disparity = cv2.imread(str(tmp_path / "disparity.tiff"), cv2.IMREAD_UNCHANGED)
     error = np.abs(disparity - truth)[judged & np.isfinite(disparity)]
-    # plain SGBM: 5.8 % and 3.6 % at density .90
-    assert (error > 1).mean() < 0.045
-    assert (error > 2).mean() < 0.02
+    # plain SGBM: 5.8 % and 3.6 % at density .90; a quarter less than that
+    assert (error > 1).mean() < 0.0435
+    assert (error > 2).mean() < 0.027
     assert np.isfinite(disparity)[judged].mean() > 0.80
     assert (tmp_path / "disparity_filled.tiff").is_file()
     assert (tmp_path / "timing.json").is_file()
