@@ -58,7 +58,7 @@ def test_a_scene_is_judged_where_both_cameras_see(folder):
     assert not scene.judged[0].any()
     assert not scene.judged[-1].any()
     marks = middlebury.marks(scene)
-    assert set(marks) == {"disparities", "plain_sgbm", "plain_sgbm_bare", "quality", "less"}
+    assert set(marks) == {"disparities", "plain_sgbm", "plain_sgbm_bare", "quality", "at_density_of", "less"}
     assert marks["plain_sgbm_bare"]["density"] < 0.85 < marks["plain_sgbm"]["density"]
     assert marks["quality"]["median_px"] < 0.2
 
@@ -90,6 +90,8 @@ def test_ours_errs_less_than_plain_sgbm_on_real_scenes():
     scene = next(s for s in middlebury.scenes(DATA) if s.name == "Motorcycle")
     marks = middlebury.marks(scene)
     assert marks["plain_sgbm"]["bad2"] == pytest.approx(0.039, abs=0.005)
-    assert marks["less"]["bad1"] > 0.25
-    assert marks["less"]["bad2"] > 0.25
+    for plain, ours in marks["at_density_of"].items():
+        assert ours["density"] >= marks[plain]["density"]
+    assert marks["less"]["plain_sgbm_bare"]["bad1"] > 0.25
+    assert marks["less"]["plain_sgbm_bare"]["bad2"] > 0.25
     assert PRESETS["quality"].matcher.kind in ("sgbm", "hybrid")

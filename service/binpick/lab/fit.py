@@ -1,6 +1,7 @@
 """Fits the laws of `stereo.trust` on the exam's tuning seeds and writes `stereo/weights.py`: `make fit`."""
 
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ QUANTILE = 0.71
 """Share of errors below sigma: more than the normal law's 68 %, since their tails are heavier than its own."""
 EVERY = 3
 """Part pixels are neighbours' likeness: each third is learned from."""
+MOST_PIXELS = 300_000
+"""More teach nothing new, and take minutes."""
 RIDGE = 1e-4
 LEAST_ERROR_PX = 0.003
 SMOOTH = 0.05
@@ -78,23 +81,29 @@ def fit(taught: Sequence[Lesson]) -> weights.Model:
     planes = np.concatenate([lesson.planes for lesson in taught]).astype(np.float64)
     two = np.concatenate([lesson.two for lesson in taught])
     error = np.concatenate([lesson.error_px for lesson in taught]).astype(np.float64)
-    return weights.Model(*(_laws(planes[some], error[some], taught[0].wrong_px) for some in (~two, two)))
+    wrong_px = taught[0].wrong_px
+    return weights.Model(_laws(planes[~two], error[~two], wrong_px, quadratic=False),
+                         _laws(planes[two], error[two], wrong_px, quadratic=True))
 
 
-def _laws(planes: Float[np.ndarray, "m n"], error: Float[np.ndarray, "m"], wrong_px: float) -> weights.Laws:
-    mean, spread = planes.mean(axis=0), planes.std(axis=0)
+def _laws(planes: Float[np.ndarray, "m n"], error: Float[np.ndarray, "m"], wrong_px: float, quadratic: bool) -> weights.Laws:
+    step = len(error) // MOST_PIXELS + 1
+    planes, error = planes[::step], error[::step]
+    first, second = np.triu_indices(planes.shape[1])
+    terms = np.column_stack([planes, planes[:, first] * planes[:, second]]) if quadratic else planes
+    mean, spread = terms.mean(axis=0), terms.std(axis=0)
     used = spread > 1e-6
-    x = np.column_stack([np.ones(len(planes)), (planes[:, used] - mean[used]) / spread[used]])
+    x = np.column_stack([np.ones(len(terms)), (terms[:, used] - mean[used]) / spread[used]])
     wrong = _logistic(x, error > wrong_px)
     likely = 1 / (1 + np.exp(-x @ wrong)) < 0.5
     sigma = _quantile(x[likely], np.log(np.maximum(error[likely], LEAST_ERROR_PX)))
 
     def law(solved: Float[np.ndarray, "k"]) -> weights.Law:
-        full = np.zeros(planes.shape[1])
+        full = np.zeros(terms.shape[1])
         full[used] = solved[1:] / spread[used]
-        rounded = [round(float(w), 4) for w in full]
-        pixels = len(evidence.OF_PIXELS)
-        return weights.Law(round(float(solved[0] - full @ mean), 4), tuple(rounded[:pixels]), tuple(rounded[pixels:]))
+        rounded = tuple(float(f"{w:.4g}") for w in full)
+        pixels, linear = len(evidence.OF_PIXELS), planes.shape[1]
+        return weights.Law(float(f"{solved[0] - full @ mean:.4g}"), rounded[:pixels], rounded[pixels:linear], rounded[linear:])
 
     return weights.Laws(law(wrong), law(sigma))
 
@@ -135,7 +144,8 @@ def text(full: weights.Model, half: weights.Model) -> str:
         for which, laws in (("alone", model.alone), ("between", model.between)):
             lines.append(f"    {which}=Laws(\n")
             for kind, law in (("wrong", laws.wrong), ("sigma", laws.sigma)):
-                lines.append(f"        {kind}=Law({law.constant}, {law.pixels},\n                  {law.cells}),\n")
+                said = f"{kind}=Law({law.constant}, {law.pixels}, {law.cells}, {law.pairs}),"
+                lines.append(textwrap.fill(said, 124, initial_indent=8 * " ", subsequent_indent=18 * " ") + "\n")
             lines.append("    ),\n")
         lines.append(")\n")
     return "".join(lines)

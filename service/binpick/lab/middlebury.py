@@ -13,10 +13,11 @@ from binpick.data import Image, Mask, Rectified
 from binpick.errors import InputError
 from binpick.lab import methods
 from binpick.lab.stereo import Field, absolute, plain_matcher, score
-from binpick.settings import PRESETS
+from binpick.settings import PRESETS, StereoSettings
 from binpick.stereo import depth, rectify
 
 FILES = ("im0.png", "im1.png", "calib.txt", "disp0GT.pfm", "mask0nocc.png")
+HALVINGS = 9
 NOT_OCCLUDED = 255
 """In mask0nocc.png; 128: hidden from the right camera, 0: unknown."""
 
@@ -48,8 +49,9 @@ def scenes(folder: Path) -> Iterator[RealScene]:
 def marks(scene: RealScene) -> dict[str, Any]:
     """Plain SGBM and ours on OpenCV's five paths, with the same range; `less` is how much lower ours is, 0 to 1.
 
-    Left of the search range OpenCV matches nothing: `plain_sgbm` gets the images with their left border repeated, as ours does,
-    and is the denser; `plain_sgbm_bare` gets them as they are. `less` is against the better of the two.
+    Left of the search range OpenCV matches nothing: `plain_sgbm_bare` gets the images as they are, as everybody calls it, and
+    `plain_sgbm` with their left border repeated, as ours does. Errors compare at equal density only: `quality` is the preset as
+    it stands, `at_density_of` the same with the risk limit at which it measures as much as each of the others; `less` is there.
     """
     pair = scene.rectified
     matcher = plain_matcher(pair.window.num_disparities, cv2.STEREO_SGBM_MODE_SGBM)
@@ -58,9 +60,25 @@ def marks(scene: RealScene) -> dict[str, Any]:
             for name, images in ((methods.PLAIN, pair), ("plain_sgbm_bare", bare))}
     maps["quality"] = depth.measure(pair, methods.five_paths(PRESETS["quality"])).disparity
     rows = {name: _row(scene, disparity) for name, disparity in maps.items()}
-    plain = {k: min(rows[name][k] for name in (methods.PLAIN, "plain_sgbm_bare")) for k in ("bad1", "bad2")}
-    return {"disparities": pair.window.num_disparities, **rows,
-            "less": {k: round(1 - rows["quality"][k] / plain[k], 3) if plain[k] else None for k in plain}}
+    settings = methods.five_paths(PRESETS["quality"])
+    equal = {name: _at_density(scene, settings, rows[name]["density"]) for name in (methods.PLAIN, "plain_sgbm_bare")}
+    less = {name: {k: round(1 - equal[name][k] / rows[name][k], 3) if rows[name][k] else None for k in ("bad1", "bad2")}
+            for name in equal}
+    return {"disparities": pair.window.num_disparities, **rows, "at_density_of": equal, "less": less}
+
+
+def _at_density(scene: RealScene, settings: StereoSettings, density: float) -> dict[str, float]:
+    """The row of the smallest risk limit that measures that much, found by halving; of the largest when none does."""
+    low, high = 0.0, 1.0
+    row = _row(scene, depth.measure(scene.rectified, settings.model_copy(update={"max_risk": high})).disparity)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        tried = _row(scene, depth.measure(scene.rectified, settings.model_copy(update={"max_risk": middle})).disparity)
+        if tried["density"] >= density:
+            high, row = middle, tried
+        else:
+            low = middle
+    return {**row, "max_risk": round(high, 4)}
 
 
 def _row(scene: RealScene, disparity: Field) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """What is measured: how likely each match is wrong, and its sigma if it is not, by two laws of the evidence.
 
-Both are linear: the log-odds of an error beyond 1 px, and the log of the error's size. Pixels between two surfaces have weights
-of their own, since what counts there (which surface is it?) is no question elsewhere. The weights were fitted on the exam's
-tuning seeds by `lab/fit.py`; `binpick bench stereo` says how well they hold.
+One gives the log-odds of an error beyond 1 px, the other the log of the error's size. Where one surface is seen both are
+linear; between two surfaces they are quadratic and have weights of their own: "which of the two?" is no question elsewhere. The
+weights were fitted on the exam's tuning seeds by `lab/fit.py`; `binpick bench stereo` says how well they hold.
 """
 
 import math
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from binpick.data import Disparity, Mask
 from binpick.stereo.evidence import Evidence
@@ -32,21 +32,37 @@ class Trust:
 def judge(evidence: Evidence, model: Model) -> Trust:
     """What the evidence says of every pixel, by the laws fitted at its resolution."""
     between = np.flatnonzero(evidence.two)
-    chosen = np.stack([plane.ravel().take(between) for plane in evidence.pixels])[:, None, :]
+    contested = _at(evidence, between)
     fields = []
-    for alone, contested in ((model.alone.wrong, model.between.wrong), (model.alone.sigma, model.between.sigma)):
-        field = _sum(evidence.pixels, alone.pixels, _of_cells(evidence, alone))
-        if between.size:
-            field.ravel()[between] = _sum(chosen, contested.pixels, _of_cells(evidence, contested).ravel().take(between)[None])
+    for alone, contest in ((model.alone.wrong, model.between.wrong), (model.alone.sigma, model.between.sigma)):
+        constant = np.full(evidence.cells.shape[1:], alone.constant, np.float32)
+        of_cells = spread(_sum(evidence.cells, alone.cells, constant), (evidence.two.shape[0], evidence.two.shape[1]))
+        field = _sum(evidence.pixels, alone.pixels, of_cells)
+        field.ravel()[between] = _contest(contested, contest)
         fields.append(field)
     odds, log_sigma = fields
     return Trust(odds, np.clip(cv2.exp(log_sigma), LEAST_SIGMA_PX, MOST_SIGMA_PX))
 
 
-def _of_cells(evidence: Evidence, law: Law) -> Float32[np.ndarray, "h w"]:
-    """What the cells add, on all pixels."""
-    constant = np.full(evidence.cells.shape[1:], law.constant, np.float32)
-    return spread(_sum(evidence.cells, law.cells, constant), (evidence.two.shape[0], evidence.two.shape[1]))
+def _at(evidence: Evidence, places: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "n k"]:
+    """All measures at some pixels, given by their place in the raster."""
+    rows, cols = evidence.cells.shape[1:]
+    v, u = np.divmod(places, evidence.two.shape[1])
+    cell = np.minimum(v // 2, rows - 1) * cols + np.minimum(u // 2, cols - 1)
+    return np.stack([plane.ravel().take(places) for plane in evidence.pixels]
+                    + [plane.ravel().take(cell) for plane in evidence.cells])
+
+
+def _contest(measures: Float32[np.ndarray, "n k"], law: Law) -> Float32[np.ndarray, "k"]:
+    """The quadratic law, summed in a fixed order."""
+    total = np.full(measures.shape[1], law.constant, np.float32)
+    pairs = iter(law.pairs)
+    for i, (measure, weight) in enumerate(zip(measures, law.pixels + law.cells, strict=True)):
+        factor = np.full_like(measure, weight)
+        for other in measures[i:] if law.pairs else ():
+            factor += other * np.float32(next(pairs))
+        total += measure * factor
+    return total
 
 
 def _sum(planes: Float32[np.ndarray, "n h w"], weights: tuple[float, ...], total: Float32[np.ndarray, "h w"],
