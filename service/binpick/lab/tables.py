@@ -71,7 +71,8 @@ def _middlebury(scenes: dict[str, Figures]) -> Table:
     for name, scene in scenes.items():
         equal = scene["at_density_of"]
         rows = [("plain SGBM", scene["plain_sgbm_bare"], None), ("ours, as dense", equal["plain_sgbm_bare"], "plain_sgbm_bare"),
-                ("plain SGBM, border repeated", scene[methods.PLAIN], None), ("ours, as dense", equal[methods.PLAIN], methods.PLAIN),
+                ("plain SGBM, border repeated", scene[methods.PLAIN], None),
+                ("ours, as dense", equal[methods.PLAIN], methods.PLAIN),
                 ("ours: quality", scene["quality"], None)]
         for method, row, against in rows:
             less = scene["less"][against] if against else {"bad1": None, "bad2": None}
