@@ -102,14 +102,19 @@ def _judged(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: R
     """Disparity, whether to believe it, and its sigma, of a strip."""
     pair = strip.of(rectified)
     judged = trust.judge(evidence.gather(found[strip.seen], refined, confidence[strip.seen], pair), model)
-    sound = trust.believed(refined.disparity, judged, max_risk) & _textured(pair.left[:, pair.margin:])
+    sound = trust.believed(refined.disparity, judged, max_risk) & _textured(refined.disparity, pair)
     return strip.inner(refined.disparity), strip.inner(sound), strip.inner(judged.sigma_px)
 
 
-def _textured(image: Image) -> Mask:
-    """Where the image varies at all within a block: black and saturated areas match everything equally well."""
-    contrast = cv2.morphologyEx(image, cv2.MORPH_GRADIENT, np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8))
-    return np.asarray(contrast >= LEAST_CONTRAST)
+def _textured(disparity: Disparity, pair: Rectified) -> Mask:
+    """Where both images vary at all within a block: black and saturated areas, or a covered camera, match everything."""
+    block = np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
+    left, right = (cv2.morphologyEx(image, cv2.MORPH_GRADIENT, block) for image in (pair.left[:, pair.margin:], pair.right))
+    rows, cols = disparity.shape
+    u = np.arange(pair.margin, pair.margin + cols, dtype=np.float32) - disparity
+    v = np.repeat(np.arange(rows, dtype=np.float32)[:, None], cols, axis=1)
+    there = cv2.remap(right, u, v, cv2.INTER_NEAREST)
+    return np.asarray(cv2.min(left, there) >= LEAST_CONTRAST)
 
 
 def of_shots(taken: tuple[Rectified, ...], lights: tuple[Light, ...], settings: StereoSettings) -> tuple[Rectified, Depth]:

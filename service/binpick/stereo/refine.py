@@ -69,7 +69,7 @@ class Refined:
 def refine(matched: Disparity, rectified: Rectified, reach: Reach) -> Refined:
     """The matched disparity (px relative to the window's smallest, NaN: none), on the window's pixels, refined."""
     cells = _cells(matched, rectified, reach.band_px)
-    level, slope_u, slope_v, misfit = _best(*_fits(cells, reach.radius), reach)
+    level, slope_u, slope_v, misfit = _best(*_fits(cells, reach.radius, rectified.window.num_disparities / 2), reach)
     shape = matched.shape
     v, u = (np.resize(np.array([-0.25, 0.25], np.float32), n) for n in shape)
     plane = spread(level, shape)
@@ -148,13 +148,11 @@ class _Planes:
     support: Cells
 
 
-def _fits(cells: _Corrected, radius: int) -> tuple[_Planes, Bool[np.ndarray, "rows cols"]]:
+def _fits(cells: _Corrected, radius: int, middle: float) -> tuple[_Planes, Bool[np.ndarray, "rows cols"]]:
     """The planes, and which cells are known. float32 suffices around the middle: |d| < 64 px, misfits good to 1e-3 px²."""
     w = cells.weight
     known = w > 0
-    # 0 where nothing is known, so the middle of the range is found without asking
-    middle = cells.disparity.max() / 2
-    d = (cells.disparity - middle) * known
+    d = (cells.disparity - np.float32(middle)) * known
     ones = np.ones(2 * radius + 1, dtype=np.float32)
     ramp = np.arange(-radius, radius + 1, dtype=np.float32)
 
@@ -174,7 +172,7 @@ def _fits(cells: _Corrected, radius: int) -> tuple[_Planes, Bool[np.ndarray, "ro
     dd = window(wd * d, ones, ones) * scale - mean_d**2
     det = uu * vv - uv * uv
     a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
-    level = mean_d - a * mean_u - b * mean_v + middle
+    level = mean_d - a * mean_u - b * mean_v + np.float32(middle)
     return _Planes(level, a, b, np.maximum(dd - a * ud - b * vd, np.float32(0)), n * np.float32(1 / ones.size**2)), known
 
 
