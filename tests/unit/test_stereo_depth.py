@@ -223,13 +223,21 @@ def grey(level: float, noise: float, seed: int) -> np.ndarray:
 
 NOTHING = {"black": (grey(0, 0, 0), grey(0, 0, 0)), "saturated": (grey(255, 0, 0), grey(255, 0, 0)),
            "foreign": (flat(20.0, seed=1).left, flat(20.0, seed=2).right),
-           "left covered": (grey(0, 0, 0), flat(20.0).right)}
+           "left covered": (grey(0, 0, 0), flat(20.0).right), "right covered": (flat(20.0).left, grey(0, 0, 0)),
+           "right saturated": (flat(20.0).left, grey(255, 0, 0)), "dark noise": (grey(4, 1.5, 1), grey(4, 1.5, 2))}
 
 
 @pytest.mark.parametrize("views", NOTHING.values(), ids=NOTHING)
 @pytest.mark.parametrize("settings", [*PRESETS.values(), StereoSettings(matcher=Bm())], ids=[*PRESETS, "bm"])
 def test_where_nothing_is_to_be_seen_next_to_nothing_is_measured(settings: StereoSettings, views: tuple) -> None:
     assert depth.measure(rectified(*views), settings).measured.mean() < 0.05
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_bare_lit_surface_is_mostly_not_measured(preset: str) -> None:
+    """Sensor noise alone; here and there it agrees by chance over a block, and nothing tells it from faint texture."""
+    for level, noise in ((60, 2.0), (120, 2.5), (200, 3.0)):
+        assert depth.measure(rectified(grey(level, noise, 1), grey(level, noise, 2)), PRESETS[preset]).measured.mean() < 0.15
 
 
 def test_more_risk_measures_more_of_the_same() -> None:

@@ -69,6 +69,18 @@ def evidence(rows: int, cols: int) -> Evidence:
                     rng.uniform(size=(rows, cols)) < 0.3)
 
 
+def test_between_surfaces_the_law_has_every_product_once() -> None:
+    size = len(OF_PIXELS) + len(OF_CELLS)
+    rng = np.random.default_rng(3)
+    measures, pairs = rng.uniform(-1, 1, (size, 50)).astype(np.float32), rng.uniform(-1, 1, size * (size + 1) // 2)
+    linear = law(0.5, 5)
+    quadratic = Law(linear.constant, linear.pixels, linear.cells, tuple(pairs.tolist()))
+    first, second = np.triu_indices(size)
+    wanted = (0.5 + np.array(linear.pixels + linear.cells) @ measures
+              + pairs @ (measures[first] * measures[second]))
+    assert np.allclose(trust._contest(measures, quadratic), wanted, atol=1e-4)
+
+
 @pytest.mark.parametrize("shape", [(10, 12), (11, 13), (2, 2)])
 def test_the_law_of_the_place_is_applied_to_every_pixel(shape: tuple[int, int]) -> None:
     model = Model(Laws(law(-1.0, 1), law(-2.0, 2)), Laws(law(0.5, 3), law(-1.5, 4)))
