@@ -237,7 +237,7 @@ def test_where_nothing_is_to_be_seen_next_to_nothing_is_measured(settings: Stere
 def test_a_bare_lit_surface_is_mostly_not_measured(preset: str) -> None:
     """Sensor noise alone; here and there it agrees by chance over a block, and nothing tells it from faint texture."""
     for level, noise in ((60, 2.0), (120, 2.5), (200, 3.0)):
-        assert depth.measure(rectified(grey(level, noise, 1), grey(level, noise, 2)), PRESETS[preset]).measured.mean() < 0.15
+        assert depth.measure(rectified(grey(level, noise, 1), grey(level, noise, 2)), PRESETS[preset]).measured.mean() < 0.2
 
 
 def test_more_risk_measures_more_of_the_same() -> None:
