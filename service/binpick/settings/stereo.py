@@ -83,7 +83,7 @@ class StereoSettings(Strict):
     """Smoothness of the filled map."""
     wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
     """How strongly the filled map respects edges of the image."""
-    max_risk: Annotated[float, Field(gt=0, le=1)] = 0.45
+    max_risk: Annotated[float, Field(gt=0, le=1)] = 0.46
     """Probability of an error beyond 1 px up to which a match counts as measured."""
     speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
     """Islands of fewer pixels do not count as measured."""
