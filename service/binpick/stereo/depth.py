@@ -13,11 +13,13 @@ from binpick.settings import StereoSettings
 from binpick.settings.stereo import Hybrid, Sgbm
 from binpick.stereo import evidence, filter, graycode, prefilter, pyramid, refine, search, shots, trust, weights
 from binpick.stereo.refine import Reach, Refined
+from binpick.stereo.warp import warp
 from binpick.stereo.weights import Model
 
 STRIP_ROWS, OVERLAP_ROWS = 248, 24
-"""Rows that are refined and judged at a time, and what they see beyond: the widest window reaches 17 rows. Both are even, as
-cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same whoever computes it."""
+"""Rows that are refined and judged at a time, and what they see beyond: planes reach 18 rows, their bend 26 (at a strip's border
+it sees two less). Both are even, as cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same
+whoever computes it."""
 TEXTURE_PX = 7
 LEAST_CONTRAST = 2
 """Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
@@ -110,11 +112,7 @@ def _textured(disparity: Disparity, pair: Rectified) -> Mask:
     """Where both images vary at all within a block: black and saturated areas, or a covered camera, match everything."""
     block = np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
     left, right = (cv2.morphologyEx(image, cv2.MORPH_GRADIENT, block) for image in (pair.left[:, pair.margin:], pair.right))
-    rows, cols = disparity.shape
-    u = np.arange(pair.margin, pair.margin + cols, dtype=np.float32) - disparity
-    v = np.repeat(np.arange(rows, dtype=np.float32)[:, None], cols, axis=1)
-    there = cv2.remap(right, u, v, cv2.INTER_NEAREST)
-    return np.asarray(cv2.min(left, there) >= LEAST_CONTRAST)
+    return np.asarray(cv2.min(left, warp(right, disparity, pair.margin, cv2.INTER_NEAREST)) >= LEAST_CONTRAST)
 
 
 def of_shots(taken: tuple[Rectified, ...], lights: tuple[Light, ...], settings: StereoSettings) -> tuple[Rectified, Depth]:

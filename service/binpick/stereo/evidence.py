@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.refine import Refined, mean_of_four
+from binpick.stereo.warp import warp
 
 Field = Float32[np.ndarray, "h w"]
 NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
@@ -87,14 +88,11 @@ class _Comparison:
     """How unlike the two images are at a disparity, in sigmas of noise, at most MOST."""
 
     def __init__(self, left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int) -> None:
-        rows, cols = left.shape
-        self._left, self._right = left, right
-        self._u = np.arange(margin, margin + cols, dtype=np.float32)
-        self._v = np.repeat(np.arange(rows, dtype=np.float32)[:, None], cols, axis=1)
+        self._left, self._right, self._margin = left, right, margin
         table = 1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))
         self._per_sigma = cv2.LUT(left, table.astype(np.float32))
 
     def at(self, disparity: Field) -> Field:
-        seen = cv2.remap(self._right, self._u - disparity, self._v, cv2.INTER_LINEAR)
+        seen = warp(self._right, disparity, self._margin, cv2.INTER_LINEAR)
         unlike = cv2.multiply(cv2.absdiff(self._left, seen), self._per_sigma, dtype=cv2.CV_32F)
         return np.asarray(cv2.min(unlike, MOST), np.float32)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from binpick.data import Disparity, Image, Rectified
+from binpick.stereo.warp import warp
 
 Field = Float32[np.ndarray, "h w"]
 Cells = Float32[np.ndarray, "rows cols"]
@@ -100,13 +101,11 @@ class _Corrected:
 
 
 def _cells(matched: Disparity, rectified: Rectified, band_px: int) -> _Corrected:
-    margin, (rows, cols) = rectified.margin, matched.shape
+    margin = rectified.margin
     known = np.isfinite(matched)
     filled = np.where(known, matched, np.float32(0))
     left, right = _band(rectified.left[:, margin:], band_px), _band(rectified.right, band_px)
-    u = np.arange(margin, margin + cols, dtype=np.float32) - filled
-    v = np.broadcast_to(np.arange(rows, dtype=np.float32)[:, None], u.shape)
-    warped = cv2.remap(cv2.merge([right, _slope(right)]), u, np.ascontiguousarray(v), cv2.INTER_LINEAR)
+    warped = warp(cv2.merge([right, _slope(right)]), filled, margin, cv2.INTER_LINEAR)
     rise = (_slope(left) + warped[..., 1]) * np.float32(0.5)
     rise *= known
     square = rise * rise
