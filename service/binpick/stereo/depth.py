@@ -17,7 +17,7 @@ from binpick.stereo.warp import warp
 from binpick.stereo.weights import Model
 
 STRIP_ROWS, OVERLAP_ROWS = 248, 24
-"""Rows that are refined and judged at a time, and what they see beyond: planes reach 18 rows, their bend 26 (at a strip's border
+"""Rows that are refined and judged at a time, and what they see beyond: planes reach 18 rows, their bend 26 (at a border
 it sees two less). Both are even, as cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same
 whoever computes it."""
 TEXTURE_PX = 7
