@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from binpick.data import Rectified
 from binpick.lab import depths, exam
-from binpick.settings import PRESETS, Hybrid, Sgbm, StereoSettings
+from binpick.settings import PRESETS, Hybrid, StereoSettings
 from binpick.stereo import evidence, filter, pyramid, refine, search, weights
 
 LESSONS = (("A", range(1, 11)), ("B", range(1, 11)))
@@ -59,9 +59,7 @@ def lessons(seeds: int) -> Iterator[tuple[Lesson, Lesson]]:
 def _lesson(pair: Rectified, settings: StereoSettings, reach: refine.Reach, target: Float32[np.ndarray, "h w"],
             part: Bool[np.ndarray, "h w"], scale: int) -> Lesson:
     """`target` is the truth on the pair's pixels, in full-resolution px; errors are the pair's own px."""
-    matcher = settings.matcher
-    if isinstance(matcher, Hybrid):
-        matcher = Sgbm.model_validate(matcher.model_dump(exclude={"kind"}))
+    matcher = settings.matcher.shrunk if isinstance(settings.matcher, Hybrid) else settings.matcher
     whole = search.search(pair.left, pair.right, pair.window.num_disparities, matcher)
     confidence, _ = filter.confirm(whole, pair, matcher, settings)
     found = np.ascontiguousarray(whole[:, pair.margin:])

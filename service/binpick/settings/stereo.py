@@ -42,6 +42,11 @@ class Hybrid(Costs):
 
     kind: Literal["hybrid"] = "hybrid"
 
+    @property
+    def shrunk(self) -> Sgbm:
+        """What searches the shrunk images."""
+        return Sgbm.model_validate(self.model_dump(exclude={"kind"}))
+
 
 class Bm(Strict):
     """Block matching: the fastest, and the first to give up where there is little texture."""

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from binpick.data import Depth, Disparity, Image, Light, Mask, Rectified, frozen
 from binpick.settings import StereoSettings
-from binpick.settings.stereo import Hybrid, Sgbm
+from binpick.settings.stereo import Hybrid
 from binpick.stereo import evidence, filter, graycode, prefilter, pyramid, refine, search, shots, trust, weights
 from binpick.stereo.refine import Reach, Refined
 from binpick.stereo.warp import warp
@@ -33,10 +33,9 @@ def measure(rectified: Rectified, settings: StereoSettings, guide: Image | None 
     """
     matcher = settings.matcher
     if isinstance(matcher, Hybrid):
-        sgbm = Sgbm.model_validate(matcher.model_dump(exclude={"kind"}))
         fewer = settings.model_copy(update={"speckle_px": settings.speckle_px // 4})
         small = None if guide is None else pyramid.guide(guide, rectified.window)
-        return pyramid.double(_measure(pyramid.shrink(rectified), sgbm, fewer, small, HALF), rectified.window)
+        return pyramid.double(_measure(pyramid.shrink(rectified), matcher.shrunk, fewer, small, HALF), rectified.window)
     return _measure(rectified, matcher, settings, guide, FULL)
 
 
