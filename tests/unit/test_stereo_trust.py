@@ -1,4 +1,4 @@
-"""Trust is a linear law of the evidence: what it says, what it allows, and that no match is measured that is none."""
+"""Trust in a match: what the evidence says of it, what it allows, and that no match is measured that is none."""
 
 import math
 
@@ -11,9 +11,10 @@ from hypothesis import given
 from binpick.stereo import trust
 from binpick.stereo.evidence import OF_CELLS, OF_PIXELS, Evidence
 from binpick.stereo.trust import Trust
-from binpick.stereo.weights import FULL, HALF, Law, Laws, Model
+from binpick.stereo.weights import FULL, HALF, Law, Model, Network
 
 SHAPE = (12, 14)
+MEASURES = len(OF_PIXELS) + len(OF_CELLS)
 ODDS = arrays.arrays(np.float32, SHAPE, elements=st.floats(-8, 8, width=32))
 RISK = st.floats(0.01, 1.0)
 FOUND = arrays.arrays(np.float32, SHAPE, elements=st.one_of(st.just(np.nan), st.floats(0, 60, width=32)))
@@ -69,29 +70,44 @@ def evidence(rows: int, cols: int) -> Evidence:
                     rng.uniform(size=(rows, cols)) < 0.3)
 
 
-def test_between_surfaces_the_law_has_every_product_once() -> None:
-    size = len(OF_PIXELS) + len(OF_CELLS)
-    rng = np.random.default_rng(3)
-    measures, pairs = rng.uniform(-1, 1, (size, 50)).astype(np.float32), rng.uniform(-1, 1, size * (size + 1) // 2)
-    linear = law(0.5, 5)
-    quadratic = Law(linear.constant, linear.pixels, linear.cells, tuple(pairs.tolist()))
-    first, second = np.triu_indices(size)
-    wanted = (0.5 + np.array(linear.pixels + linear.cells) @ measures
-              + pairs @ (measures[first] * measures[second]))
-    assert np.allclose(trust._contest(measures, quadratic), wanted, atol=1e-4)
+def network(constant: float, seed: int, units: int = 3) -> Network:
+    rng = np.random.default_rng(seed)
+    out, offsets, hidden = (rng.uniform(-1, 1, shape) for shape in (units, units, (units, MEASURES)))
+    return Network(constant, tuple(out.tolist()), tuple(offsets.tolist()), tuple(map(tuple, hidden.tolist())))
+
+
+def answer(net: Network, measures: np.ndarray) -> float:
+    """The formula of the docstring, in doubles."""
+    return float(net.constant + np.array(net.out) @ np.maximum(np.array(net.hidden) @ measures + np.array(net.offsets), 0))
+
+
+def test_a_network_answers_every_column_also_beyond_a_block() -> None:
+    net = network(0.5, 5)
+    measures = np.random.default_rng(3).uniform(-1, 1, (MEASURES, trust.BLOCK + 7)).astype(np.float32)
+    answers = trust._answer(net, measures)
+    for k in (0, 1, trust.BLOCK - 1, trust.BLOCK, trust.BLOCK + 6):
+        assert answers[k] == pytest.approx(answer(net, measures[:, k]), abs=1e-5)
+    assert trust._answer(net, measures[:, :0]).shape == (0,)
 
 
 @pytest.mark.parametrize("shape", [(10, 12), (11, 13), (2, 2)])
-def test_the_law_of_the_place_is_applied_to_every_pixel(shape: tuple[int, int]) -> None:
-    model = Model(Laws(law(-1.0, 1), law(-2.0, 2)), Laws(law(0.5, 3), law(-1.5, 4)))
+def test_what_holds_at_the_place_is_said_of_every_pixel(shape: tuple[int, int]) -> None:
+    model = Model(law(-1.0, 1), network(-2.0, 2), network(0.5, 3), network(-1.5, 4))
     seen = evidence(*shape)
     result = trust.judge(seen, model)
     rows, cols = (np.minimum(np.arange(side) // 2, side // 2 - 1) for side in shape)
     for v in range(shape[0]):
         for u in range(shape[1]):
-            laws = model.between if seen.two[v, u] else model.alone
-            measures = np.concatenate([seen.pixels[:, v, u], seen.cells[:, rows[v], cols[u]]])
-            odds, log_sigma = (one.constant + measures @ (*one.pixels, *one.cells) for one in (laws.wrong, laws.sigma))
+            down, across = rows[v], cols[u]
+            cell = seen.cells[:, down, across]
+            pixels = seen.pixels[:, v, u]
+            if seen.two[v, u]:
+                odds, log_sigma = (answer(net, np.concatenate([pixels, cell]))
+                                   for net in (model.wrong_between, model.sigma_between))
+            else:
+                odds = model.wrong.constant + pixels @ model.wrong.pixels + cell @ model.wrong.cells
+                means = seen.pixels[:, 2 * down:2 * down + 2, 2 * across:2 * across + 2].mean(axis=(1, 2))
+                log_sigma = answer(model.sigma, np.concatenate([means, cell]))
             assert result.odds[v, u] == pytest.approx(odds, abs=1e-4)
             assert result.sigma_px[v, u] == pytest.approx(np.clip(math.exp(log_sigma), 0.02, 3.0), rel=1e-4)
 
@@ -99,18 +115,19 @@ def test_the_law_of_the_place_is_applied_to_every_pixel(shape: tuple[int, int]) 
 def test_sigma_stays_within_what_can_be_known() -> None:
     seen = evidence(10, 12)
     for constant in (-50.0, 50.0):
-        extreme = Laws(law(constant, 1), law(constant, 2))
-        sigma = trust.judge(seen, Model(extreme, extreme)).sigma_px
+        extreme = network(constant, 2)
+        sigma = trust.judge(seen, Model(law(constant, 1), extreme, extreme, extreme)).sigma_px
         assert (sigma >= np.float32(trust.LEAST_SIGMA_PX)).all()
         assert (sigma <= np.float32(trust.MOST_SIGMA_PX)).all()
 
 
 @pytest.mark.parametrize("model", [FULL, HALF], ids=["full", "half"])
-def test_the_fitted_laws_know_every_measure_and_their_signs_make_sense(model: Model) -> None:
-    for laws in (model.alone, model.between):
-        for one in (laws.wrong, laws.sigma):
-            assert (len(one.pixels), len(one.cells)) == (len(OF_PIXELS), len(OF_CELLS))
-    wrong = dict(zip((*OF_PIXELS, *OF_CELLS), (*model.alone.wrong.pixels, *model.alone.wrong.cells), strict=True))
+def test_what_was_fitted_knows_every_measure_and_the_signs_of_the_law_make_sense(model: Model) -> None:
+    assert (len(model.wrong.pixels), len(model.wrong.cells)) == (len(OF_PIXELS), len(OF_CELLS))
+    for net in (model.sigma, model.wrong_between, model.sigma_between):
+        assert len(net.out) == len(net.offsets) == len(net.hidden)
+        assert {len(unit) for unit in net.hidden} == {MEASURES}
+    wrong = dict(zip((*OF_PIXELS, *OF_CELLS), (*model.wrong.pixels, *model.wrong.cells), strict=True))
     # images that differ, planes that depart or do not fit, and holes around never speak for a match
     assert min(wrong[name] for name in ("departure", "mismatch", "misfit", "holes")) > 0
-    assert model.alone.wrong.pixels[OF_PIXELS.index("rival")] == 0, "where one surface is seen, it has no rival"
+    assert wrong["rival"] == 0, "where one surface is seen, it has no rival"

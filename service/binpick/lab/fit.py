@@ -1,8 +1,10 @@
 """Fits the laws of `stereo.trust` on the exam's tuning seeds and writes `stereo/weights.py`: `make fit`."""
 
+import dataclasses
+import math
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,29 +21,45 @@ LESSONS = (("A", range(1, 11)), ("B", range(1, 11)))
 """World and seeds. Steel and scenes without the projector taught nothing but to distrust the others."""
 OFF_PX = 1.0
 """An error beyond this is what `wrong` means."""
-QUANTILE = 0.71
-"""Share of errors below sigma: more than the normal law's 68 %, since their tails are heavier than its own."""
-EVERY = 3
-"""Part pixels are neighbours' likeness: each third is learned from."""
-MOST_PIXELS = 300_000
-"""More teach nothing new, and take minutes."""
-RIDGE = 1e-4
+WITHIN, WITHIN_TWICE = 0.69, 0.945
+"""Shares of errors below sigma and below twice sigma: between the normal law's and what heavier tails leave of it."""
+ALONE, BETWEEN = 20_000, 10_000
+"""Pixels that a scene teaches at most, of each kind: as many in either world, however large its parts appear."""
+HIDDEN = 12
+"""Rectifiers of a network; 16 told no more, 8 a little less."""
+STEPS = 500
+RIDGE, NETWORK_RIDGE = 1e-4, 1e-5
 LEAST_ERROR_PX = 0.003
 SMOOTH = 0.05
 """The quantile's kink is rounded over so much of log px, or its slope would jump for the optimiser."""
 
 
+Loss = Callable[[Float[np.ndarray, "m"]], tuple[float, Float[np.ndarray, "m"]]]
+"""Mean loss of some answers, and its slope by each of them times their number."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Lesson:
-    """Matched part pixels: evidence, whether between two surfaces, and the error, px; beyond `wrong_px` it is one."""
+    """Some matched part pixels where one surface is seen, or between two: their evidence, and the error in the pair's px.
+
+    `means` has the evidence of the pixels' cells.
+    """
 
     planes: Float32[np.ndarray, "m n"]
-    two: Bool[np.ndarray, "m"]
+    means: Float32[np.ndarray, "m n"]
     error_px: Float32[np.ndarray, "m"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What a scene teaches at one resolution, where an error beyond `wrong_px` is one."""
+
+    alone: Lesson
+    between: Lesson
     wrong_px: float
 
 
-def lessons(seeds: int) -> Iterator[tuple[Lesson, Lesson]]:
+def lessons(seeds: int) -> Iterator[tuple[Scene, Scene]]:
     """What the tuning scenes teach at full and at half resolution; `seeds` limits how many of each kind."""
     quality, fast = PRESETS["quality"], PRESETS["fast"]
     for world, some in LESSONS:
@@ -52,12 +70,14 @@ def lessons(seeds: int) -> Iterator[tuple[Lesson, Lesson]]:
             part = truth.part_id > 0
             target = truth.disparity - np.float32(pair.window.min_disparity)
             rows, cols = (side // 2 * 2 for side in part.shape)
-            yield (_lesson(pair, quality, refine.FULL, target, part, 1),
-                   _lesson(pyramid.shrink(pair), fast, refine.HALF, target[:rows:2, :cols:2], part[:rows:2, :cols:2], 2))
+            nearest, mean = target[:rows:2, :cols:2], refine.mean_of_four(target)
+            coarse = np.where(np.abs(mean - nearest) < 2 * pyramid.SAME_SURFACE_PX, mean, nearest)
+            yield (_scene(pair, quality, refine.FULL, target, part, 1),
+                   _scene(pyramid.shrink(pair), fast, refine.HALF, coarse, part[:rows:2, :cols:2], 2))
 
 
-def _lesson(pair: Rectified, settings: StereoSettings, reach: refine.Reach, target: Float32[np.ndarray, "h w"],
-            part: Bool[np.ndarray, "h w"], scale: int) -> Lesson:
+def _scene(pair: Rectified, settings: StereoSettings, reach: refine.Reach, target: Float32[np.ndarray, "h w"],
+           part: Bool[np.ndarray, "h w"], scale: int) -> Scene:
     """`target` is the truth on the pair's pixels, in full-resolution px; errors are the pair's own px."""
     matcher = settings.matcher.shrunk if isinstance(settings.matcher, Hybrid) else settings.matcher
     whole = search.search(pair.left, pair.right, pair.window.num_disparities, matcher)
@@ -68,69 +88,123 @@ def _lesson(pair: Rectified, settings: StereoSettings, reach: refine.Reach, targ
     height, width = target.shape
     off = np.abs(refined.disparity[:height, :width] - target / scale)
     judged = part & np.isfinite(off)
-    pixels = seen.pixels[:, :height, :width][:, judged]
-    cells = np.stack([refine.spread(plane, (found.shape[0], found.shape[1]))[:height, :width][judged] for plane in seen.cells])
-    planes = np.concatenate([pixels, cells]).T[::EVERY]
-    return Lesson(planes.copy(), seen.two[:height, :width][judged][::EVERY], off[judged][::EVERY], OFF_PX / scale)
+    rng = np.random.default_rng(0)
+
+    def lesson(here: Bool[np.ndarray, "h w"], most: int) -> Lesson:
+        places = np.flatnonzero(here)
+        places = np.sort(rng.choice(places, min(most, len(places)), replace=False))
+
+        def at(planes: Iterable[Float32[np.ndarray, "h2 w2"]]) -> list[Float32[np.ndarray, "m"]]:
+            whole = (refine.spread(plane, (found.shape[0], found.shape[1])) for plane in planes)
+            return [plane[:height, :width].ravel()[places] for plane in whole]
+
+        cells = at(seen.cells)
+        pixels = [plane[:height, :width].ravel()[places] for plane in seen.pixels]
+        means = at(refine.mean_of_four(plane) for plane in seen.pixels)
+        return Lesson(np.stack(pixels + cells, axis=1), np.stack(means + cells, axis=1), off.ravel()[places])
+
+    two = seen.two[:height, :width]
+    return Scene(lesson(judged & ~two, ALONE), lesson(judged & two, BETWEEN), OFF_PX / scale)
 
 
-def fit(taught: Sequence[Lesson]) -> weights.Model:
-    """The laws of one resolution."""
-    planes = np.concatenate([lesson.planes for lesson in taught]).astype(np.float64)
-    two = np.concatenate([lesson.two for lesson in taught])
-    error = np.concatenate([lesson.error_px for lesson in taught]).astype(np.float64)
+def fit(taught: Sequence[Scene]) -> weights.Model:
+    """What is known of one resolution."""
     wrong_px = taught[0].wrong_px
-    return weights.Model(_laws(planes[~two], error[~two], wrong_px, quadratic=False),
-                         _laws(planes[two], error[two], wrong_px, quadratic=True))
+    alone, between = _joined([scene.alone for scene in taught]), _joined([scene.between for scene in taught])
+    wrong, odds = _law(alone.planes, alone.error_px > wrong_px)
+    wrong_between = network(between.planes, likelihood(between.error_px > wrong_px))
+    sure, sure_between = odds < 0, _answers(wrong_between, between.planes) < 0
+    return weights.Model(wrong, network(alone.means[sure], shares(alone.error_px[sure])), wrong_between,
+                         network(between.planes[sure_between], shares(between.error_px[sure_between])))
 
 
-def _laws(planes: Float[np.ndarray, "m n"], error: Float[np.ndarray, "m"], wrong_px: float, quadratic: bool) -> weights.Laws:
-    step = len(error) // MOST_PIXELS + 1
-    planes, error = planes[::step], error[::step]
-    first, second = np.triu_indices(planes.shape[1])
-    terms = np.column_stack([planes, planes[:, first] * planes[:, second]]) if quadratic else planes
-    mean, spread = terms.mean(axis=0), terms.std(axis=0)
-    used = spread > 1e-6
-    x = np.column_stack([np.ones(len(terms)), (terms[:, used] - mean[used]) / spread[used]])
-    wrong = _logistic(x, error > wrong_px)
-    likely = 1 / (1 + np.exp(-x @ wrong)) < 0.5
-    sigma = _quantile(x[likely], np.log(np.maximum(error[likely], LEAST_ERROR_PX)))
-
-    def law(solved: Float[np.ndarray, "k"]) -> weights.Law:
-        full = np.zeros(terms.shape[1])
-        full[used] = solved[1:] / spread[used]
-        rounded = tuple(float(f"{w:.4g}") for w in full)
-        pixels, linear = len(evidence.OF_PIXELS), planes.shape[1]
-        return weights.Law(float(f"{solved[0] - full @ mean:.4g}"), rounded[:pixels], rounded[pixels:linear], rounded[linear:])
-
-    return weights.Laws(law(wrong), law(sigma))
+def _joined(lessons: Sequence[Lesson]) -> Lesson:
+    return Lesson(*(np.concatenate([getattr(lesson, field) for lesson in lessons])
+                    for field in ("planes", "means", "error_px")))
 
 
-def _logistic(x: Float[np.ndarray, "m k"], wrong: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "k"]:
-    """Maximum likelihood of the log-odds."""
+def _answers(net: weights.Network, planes: Float32[np.ndarray, "m n"]) -> Float[np.ndarray, "m"]:
+    active = np.maximum(planes @ np.transpose(net.hidden) + np.array(net.offsets), 0)
+    answers: Float[np.ndarray, "m"] = active @ np.array(net.out) + net.constant
+    return answers
+
+
+def likelihood(wrong: Bool[np.ndarray, "m"]) -> Loss:
+    """Of log-odds: maximum likelihood."""
+
+    def loss(odds: Float[np.ndarray, "m"]) -> tuple[float, Float[np.ndarray, "m"]]:
+        return float(np.mean(np.logaddexp(0, odds) - wrong * odds)), 1 / (1 + np.exp(-odds)) - wrong
+
+    return loss
+
+
+def shares(error_px: Float32[np.ndarray, "m"]) -> Loss:
+    """Of the log of sigma: quantile regression (Koenker and Bassett 1978) of it and its double at once, kinks rounded."""
+    y = np.log(np.maximum(error_px, LEAST_ERROR_PX))
+
+    def loss(log_sigma: Float[np.ndarray, "m"]) -> tuple[float, Float[np.ndarray, "m"]]:
+        value, slope = 0.0, np.zeros_like(log_sigma)
+        for share, times in ((WITHIN, 1), (WITHIN_TWICE, 2)):
+            left = (y - log_sigma - math.log(times)) / SMOOTH
+            value += float(SMOOTH * np.mean(share * left + np.logaddexp(0, -left)))
+            slope -= share - 1 / (1 + np.exp(np.clip(left, -60, 60)))
+        return value, slope
+
+    return loss
+
+
+def _law(planes: Float32[np.ndarray, "m n"], wrong: Bool[np.ndarray, "m"]) -> tuple[weights.Law, Float[np.ndarray, "m"]]:
+    """The linear law of the log-odds, and what it says of the lesson."""
+    x, mean, scale = _standard(planes)
+    likely = likelihood(wrong)
 
     def loss(w: Float[np.ndarray, "k"]) -> tuple[float, Float[np.ndarray, "k"]]:
-        odds = x @ w
-        slope = 1 / (1 + np.exp(-odds)) - wrong
-        return float(np.mean(np.logaddexp(0, odds) - wrong * odds) + RIDGE * (w @ w)), x.T @ slope / len(x) + 2 * RIDGE * w
+        value, slope = likely(x @ w[1:] + w[0])
+        return value + RIDGE * float(w @ w), np.concatenate([[slope.mean()], x.T @ slope / len(x)]) + 2 * RIDGE * w
 
-    found: Float[np.ndarray, "k"] = minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B").x
-    return found
+    solved = minimize(loss, np.zeros(x.shape[1] + 1), jac=True, method="L-BFGS-B").x
+    each, pixels = solved[1:] / scale, len(evidence.OF_PIXELS)
+    return (weights.Law(_rounded(solved[0] - each @ mean)[0], _rounded(each[:pixels]), _rounded(each[pixels:])),
+            x @ solved[1:] + solved[0])
 
 
-def _quantile(x: Float[np.ndarray, "m k"], y: Float[np.ndarray, "m"]) -> Float[np.ndarray, "k"]:
-    """Linear quantile regression (Koenker and Bassett 1978), its kink rounded."""
+def network(planes: Float32[np.ndarray, "m n"], of: Loss) -> weights.Network:
+    """The network with the smallest loss that is found from one random beginning."""
+    x, mean, scale = _standard(planes)
+    count, size = x.shape
+    rng = np.random.default_rng(0)
+    begin = np.concatenate([rng.normal(0, size**-0.5, size * HIDDEN), rng.normal(0, 0.5, HIDDEN), rng.normal(0, 0.1, HIDDEN),
+                            [0]])
+
+    def parts(w: np.ndarray) -> tuple[np.ndarray, ...]:
+        hidden, offsets, out, constant = np.split(w, [size * HIDDEN, (size + 1) * HIDDEN, (size + 2) * HIDDEN])
+        return hidden.reshape(size, HIDDEN), offsets, out, constant
 
     def loss(w: Float[np.ndarray, "k"]) -> tuple[float, Float[np.ndarray, "k"]]:
-        left = (y - x @ w) / SMOOTH
-        slope = QUANTILE - 1 / (1 + np.exp(np.clip(left, -60, 60)))
-        value = SMOOTH * np.mean(QUANTILE * left + np.logaddexp(0, -left))
-        return float(value + RIDGE * (w @ w)), -x.T @ slope / len(x) + 2 * RIDGE * w
+        hidden, offsets, out, constant = parts(w.astype(np.float32))
+        active = np.maximum(x @ hidden + offsets, 0)
+        value, slope = of(active @ out + constant)
+        slope = (slope / count).astype(np.float32)
+        back = (slope[:, None] * out) * (active > 0)
+        gradient = np.concatenate([(x.T @ back).ravel(), back.sum(0), active.T @ slope, [slope.sum()]])
+        return value + NETWORK_RIDGE * float(w @ w), gradient + 2 * NETWORK_RIDGE * w
 
-    begin = np.zeros(x.shape[1])
-    begin[0] = np.quantile(y, QUANTILE)
-    found: Float[np.ndarray, "k"] = minimize(loss, begin, jac=True, method="L-BFGS-B").x
-    return found
+    found = minimize(loss, begin, jac=True, method="L-BFGS-B", options={"maxiter": STEPS, "maxfun": 2 * STEPS}).x
+    hidden, offsets, out, constant = parts(found)
+    each = hidden / scale[:, None]
+    return weights.Network(_rounded(constant)[0], _rounded(out), _rounded(offsets - mean @ each),
+                           tuple(_rounded(unit) for unit in each.T))
+
+
+def _standard(planes: Float32[np.ndarray, "m n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each measure with mean 0 and spread 1, what was taken off and divided by; what never changes tells nothing."""
+    mean, scale = planes.mean(axis=0, dtype=np.float64), planes.std(axis=0, dtype=np.float64)
+    scale = np.where(scale > 1e-6, scale, np.inf)
+    return ((planes - mean) / scale).astype(np.float32), mean, scale
+
+
+def _rounded(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(f"{value:.4g}") for value in np.atleast_1d(values))
 
 
 def text(full: weights.Model, half: weights.Model) -> str:
@@ -139,12 +213,9 @@ def text(full: weights.Model, half: weights.Model) -> str:
     lines = [source[:source.index("FULL = ")]]
     for name, model in (("FULL", full), ("HALF", half)):
         lines.append(f"{name} = Model(\n")
-        for which, laws in (("alone", model.alone), ("between", model.between)):
-            lines.append(f"    {which}=Laws(\n")
-            for kind, law in (("wrong", laws.wrong), ("sigma", laws.sigma)):
-                said = f"{kind}=Law({law.constant}, {law.pixels}, {law.cells}, {law.pairs}),"
-                lines.append(textwrap.fill(said, 124, initial_indent=8 * " ", subsequent_indent=18 * " ") + "\n")
-            lines.append("    ),\n")
+        for field in dataclasses.fields(model):
+            said = f"{field.name}={getattr(model, field.name)},"
+            lines.append(textwrap.fill(said, 124, initial_indent=4 * " ", subsequent_indent=8 * " ") + "\n")
         lines.append(")\n")
     return "".join(lines)
 

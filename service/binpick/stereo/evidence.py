@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
-from binpick.stereo.refine import Refined, mean_of_four
+from binpick.stereo.refine import Cells, Refined, mean_of_four
 from binpick.stereo.warp import warp
 
 Field = Float32[np.ndarray, "h w"]
@@ -16,20 +16,24 @@ NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
 MOST = 5.0
 """Differences between the images count up to so many sigma of noise: beyond, something else is seen."""
 NEAR_PX, AROUND_PX = 3, 5
-BLOCK_CELLS, WIDE_CELLS = 3, 5
+BLOCK_CELLS, WIDE_CELLS, GLINT_CELLS, GLOSS_CELLS = 3, 5, 7, 15
 """Sides of the squares that are looked at, in pixels and in cells of 2x2 px."""
+DARK = 5.0
+"""Grey levels below which a ratio of brightness means little."""
 TWO_SURFACES_PX = 1.5
 """Disparities that differ by more within 5x5 px are two hypotheses for the pixels between them."""
 MOST_JUMP_PX = 6.0
 """No jump is more of a jump than this one; 12 px or its root told less on the tuning seeds."""
 OF_PIXELS = ("rival", "spread", "spread_near", "departure", "mismatch")
-OF_CELLS = ("misfit", "slope", "bend", "texture", "holes", "unconfirmed", "bright")
+OF_CELLS = ("misfit", "slope", "bend", "support", "texture", "holes", "unconfirmed", "bright", "gloss", "glint", "glint_near")
 """The planes of `Evidence`, in their order; what changes slowly is kept for cells of 2x2 px.
 
 rival: how much better (sigma) the other surface within 5x5 px explains the 3x3 px around, 0 where there is none. spread: range
-of disparities in 5x5 and 3x3. departure, misfit (log), slope, bend: of the plane (see `refine`). mismatch: difference of the
+of disparities in 5x5 and 3x3. departure, misfit, slope, bend, support: of the plane (see `refine`). mismatch: difference of the
 images at this disparity, 3x3. texture: log of the image's squared slope, 6x6. holes: share of the 10x10 px without a match.
-unconfirmed: what the filter's confidence leaves. bright: mean grey level / 100, 6x6: in shadow little is sure.
+unconfirmed: what the filter's confidence leaves. bright: mean grey level / 100, 6x6: in shadow little is sure. gloss: log of
+how much the views differ in brightness, 30x30; glint, glint_near: how that changes per cell along the row, 14x14 and 6x6: where
+it does, a highlight moves across the surface and takes the match along.
 """
 
 
@@ -55,26 +59,39 @@ def gather(matched: Disparity, refined: Refined, confidence: UInt8[np.ndarray, "
     near_high, near_low = _extremes(flat, deep, NEAR_PX)
     np.clip(near_high - near_low, 0, MOST_JUMP_PX, out=put["spread_near"])
     compare = _Comparison(left, rectified.right, rectified.margin)
-    cv2.blur(compare.at(flat), (NEAR_PX, NEAR_PX), dst=put["mismatch"])
-    difference = cv2.blur(compare.at(high) - compare.at(low), (NEAR_PX, NEAR_PX))
+    seen = compare.seen(flat)
+    cv2.blur(compare.unlike(seen), (NEAR_PX, NEAR_PX), dst=put["mismatch"])
+    difference = cv2.blur(compare.unlike(compare.seen(high)) - compare.unlike(compare.seen(low)), (NEAR_PX, NEAR_PX))
     np.multiply(np.where(2 * matched > high + low, difference, -difference), two, out=put["rival"])
     np.fmin(refined.departure, 2, out=put["departure"])
-    return Evidence(pixels, _of_cells(left, known, refined, confidence), two)
+    return Evidence(pixels, _of_cells(left, seen, known, refined, confidence), two)
 
 
-def _of_cells(left: Image, known: Bool[np.ndarray, "h w"], refined: Refined, confidence: UInt8[np.ndarray, "h w"],
-              ) -> Float32[np.ndarray, "m h2 w2"]:
+def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined: Refined,
+              confidence: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "m h2 w2"]:
     rows, cols = refined.misfit.shape
     cells = np.empty((len(OF_CELLS), rows, cols), np.float32)
     put = dict(zip(OF_CELLS, cells, strict=True))
     put["misfit"][:], put["slope"][:], put["bend"][:] = refined.misfit, refined.slope, refined.bend
+    put["support"][:] = refined.support
     slope = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
     np.log(1 + cv2.blur(mean_of_four(slope * slope), (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
     missing = 1 - mean_of_four(known.astype(np.float32))
     cv2.blur(missing, (WIDE_CELLS, WIDE_CELLS), dst=put["holes"])
     np.multiply(255 - confidence[:2 * rows:2, :2 * cols:2], np.float32(1 / 255), out=put["unconfirmed"])
-    np.multiply(cv2.blur(mean_of_four(left), (BLOCK_CELLS, BLOCK_CELLS)), np.float32(1 / 100), out=put["bright"])
+    bright, other = mean_of_four(left), mean_of_four(seen)
+    np.multiply(cv2.blur(bright, (BLOCK_CELLS, BLOCK_CELLS)), np.float32(1 / 100), out=put["bright"])
+    np.abs(_brighter(bright, other, GLOSS_CELLS), out=put["gloss"])
+    for name, size in (("glint", GLINT_CELLS), ("glint_near", BLOCK_CELLS)):
+        change = cv2.Sobel(_brighter(bright, other, size), cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
+        np.abs(np.asarray(change, np.float32), out=put[name])
     return cells
+
+
+def _brighter(bright: Cells, other: Cells, size: int) -> Cells:
+    """Log of how much brighter the left view is than the right one around."""
+    one, two = (cv2.blur(image, (size, size)) + np.float32(DARK) for image in (bright, other))
+    return np.asarray(np.log(one / two), np.float32)
 
 
 def _extremes(flat: Field, deep: Field, size: int) -> tuple[Field, Field]:
@@ -92,7 +109,10 @@ class _Comparison:
         table = 1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))
         self._per_sigma = cv2.LUT(left, table.astype(np.float32))
 
-    def at(self, disparity: Field) -> Field:
-        seen = warp(self._right, disparity, self._margin, cv2.INTER_LINEAR)
+    def seen(self, disparity: Field) -> Image:
+        """The right image as the left view sees it."""
+        return warp(self._right, disparity, self._margin, cv2.INTER_LINEAR)
+
+    def unlike(self, seen: Image) -> Field:
         unlike = cv2.multiply(cv2.absdiff(self._left, seen), self._per_sigma, dtype=cv2.CV_32F)
         return np.asarray(cv2.min(unlike, MOST), np.float32)

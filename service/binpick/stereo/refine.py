@@ -2,15 +2,15 @@
 
 The correction is one Gauss-Newton step of image registration (Lucas and Kanade 1981): where the right image, warped by the
 disparity, differs by e from the left one and rises by g per px, the match is e/g px off, and says so with weight g². Planes
-through the weighted corrections of a window take out their noise and the matcher's pixel locking; since the window that fits
-best may stand to any side of the pixel, they do not reach across depth edges.
+through the weighted corrections of a window take out their noise and the matcher's pixel locking. Windows stand around the
+pixel and to all sides of it; each has its say the more the better its plane fits, so that they do not reach across depth edges.
 """
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.warp import warp
@@ -24,7 +24,9 @@ STRONG = 200.0
 LEAST_WEIGHT = 0.02
 """What a cell without any slope still weighs: it says what the matcher said."""
 ASIDE = 2.0
-"""How many times better a window aside must fit than the one around the pixel."""
+"""How many times better a window aside must fit to have the same say as the one around the pixel."""
+LEAST_COST = 1e-5
+"""Squared px: no plane fits better than this, and no window outvotes all others by more."""
 SLOPE_PRIOR = 0.05
 """Cells² added to the windows' moments: keeps planes with little support level."""
 TRUSTED_PX = 0.6
@@ -41,12 +43,6 @@ class Reach:
     radius: int
     band_px: int
 
-    @property
-    def windows(self) -> tuple[tuple[int, int], ...]:
-        """Rows and columns from a cell to the middles of the windows it may belong to, its own first."""
-        steps = (0, -self.radius, self.radius)
-        return tuple((dv, du) for dv in steps for du in steps)
-
 
 FULL, HALF = Reach(radius=3, band_px=9), Reach(radius=2, band_px=5)
 """At full resolution windows of 14x14 px; of 20x20 px at half, where a pixel is worth two."""
@@ -56,8 +52,9 @@ FULL, HALF = Reach(radius=3, band_px=9), Reach(radius=2, band_px=5)
 class Refined:
     """Disparities in px relative to the window's smallest; NaN where nothing was matched. Cells are 2x2 px.
 
-    `departure` is how far the plane lies from the match (px), `misfit` the logarithm of its mean squared residual (px²),
-    `slope` its steepness and `bend` how far that differs from the steepness around, both px per px.
+    `departure` is how far the plane lies from the match (px), `misfit` the logarithm of its mean squared residual (px²), more
+    where little supports it, `support` the mean weight of the corrections around (squared grey levels per px), `slope` its
+    steepness and `bend` how far that differs from the steepness around, both px per px.
     """
 
     disparity: Disparity
@@ -65,24 +62,27 @@ class Refined:
     misfit: Cells
     slope: Cells
     bend: Cells
+    support: Cells
 
 
 def refine(matched: Disparity, rectified: Rectified, reach: Reach) -> Refined:
     """The matched disparity (px relative to the window's smallest, NaN: none), on the window's pixels, refined."""
     cells = _cells(matched, rectified, reach.band_px)
-    level, slope_u, slope_v, misfit = _best(*_fits(cells, reach.radius, rectified.window.num_disparities / 2), reach)
+    middle = rectified.window.num_disparities / 2
+    planes = _fits(cells, reach.radius, middle)
+    vote = _vote(planes, reach.radius, middle)
     shape = matched.shape
     v, u = (np.resize(np.array([-0.25, 0.25], np.float32), n) for n in shape)
-    plane = spread(level, shape)
-    plane += spread(slope_u, shape) * u
-    plane += spread(slope_v, shape) * v[:, None]
+    plane = spread(np.where(cells.weight > 0, vote.level, np.float32(np.nan)), shape)
+    plane += spread(vote.slope_u, shape) * u
+    plane += spread(vote.slope_v, shape) * v[:, None]
     departure = np.abs(plane - matched)
     with np.errstate(invalid="ignore"):
         disparity = np.where(departure < TRUSTED_PX, plane, matched)
     # not cv2.magnitude: its last bit depends on where in memory the arrays lie
-    steepness = np.minimum(np.sqrt(slope_u * slope_u + slope_v * slope_v) / 2, np.float32(1))
-    return Refined(disparity, departure, np.log(np.minimum(misfit, 10) + np.float32(1e-4)), steepness,
-                   _bend(slope_u, slope_v, reach.radius))
+    steepness = np.minimum(np.sqrt(vote.slope_u * vote.slope_u + vote.slope_v * vote.slope_v) / 2, np.float32(1))
+    bend = _bend(vote.slope_u, vote.slope_v, reach.radius)
+    return Refined(disparity, departure, vote.misfit, steepness, bend, planes.support)
 
 
 def _bend(slope_u: Cells, slope_v: Cells, radius: int) -> Cells:
@@ -147,11 +147,10 @@ class _Planes:
     support: Cells
 
 
-def _fits(cells: _Corrected, radius: int, middle: float) -> tuple[_Planes, Bool[np.ndarray, "rows cols"]]:
-    """The planes, and which cells are known. float32 suffices around the middle: |d| < 64 px, misfits good to 1e-3 px²."""
+def _fits(cells: _Corrected, radius: int, middle: float) -> _Planes:
+    """The planes. float32 suffices around the middle: |d| < 64 px, misfits good to 1e-3 px²."""
     w = cells.weight
-    known = w > 0
-    d = (cells.disparity - np.float32(middle)) * known
+    d = (cells.disparity - np.float32(middle)) * (w > 0)
     ones = np.ones(2 * radius + 1, dtype=np.float32)
     ramp = np.arange(-radius, radius + 1, dtype=np.float32)
 
@@ -172,26 +171,44 @@ def _fits(cells: _Corrected, radius: int, middle: float) -> tuple[_Planes, Bool[
     det = uu * vv - uv * uv
     a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
     level = mean_d - a * mean_u - b * mean_v + np.float32(middle)
-    return _Planes(level, a, b, np.maximum(dd - a * ud - b * vd, np.float32(0)), n * np.float32(1 / ones.size**2)), known
+    return _Planes(level, a, b, np.maximum(dd - a * ud - b * vd, np.float32(0)), n * np.float32(1 / ones.size**2))
 
 
-def _best(planes: _Planes, known: Bool[np.ndarray, "rows cols"], reach: Reach) -> tuple[Cells, Cells, Cells, Cells]:
-    """Of the windows around and aside of each cell the plane that fits best, continued to the cell; NaN: cell not known."""
-    (rows, cols), r = known.shape, reach.radius
-    cost = np.pad(planes.misfit + np.float32(1e-3) / (planes.support + np.float32(1e-3)), r, constant_values=np.inf)
-    best = cost[r:r + rows, r:r + cols].copy()
-    choice = np.zeros(known.shape, dtype=np.uint8)
-    for k, (dv, du) in enumerate(reach.windows[1:], 1):
-        aside = cost[r + dv:r + dv + rows, r + du:r + du + cols] * np.float32(ASIDE)
-        better = aside < best
-        choice[better] = k
-        np.copyto(best, aside, where=better)
-    down, across = (np.array(offsets, dtype=np.int32).take(choice) for offsets in zip(*reach.windows, strict=True))
-    source = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols) + down * cols + across
-    slope_u, slope_v = planes.slope_u.ravel().take(source), planes.slope_v.ravel().take(source)
-    level = planes.level.ravel().take(source) - slope_u * across.astype(np.float32) - slope_v * down.astype(np.float32)
-    level[~known] = np.nan
-    return level, slope_u, slope_v, best
+@dataclass(frozen=True, slots=True, eq=False)
+class _Vote:
+    """The weighted mean of the planes of a cell's windows, continued to the cell; `misfit` is the logarithm of theirs, px²."""
+
+    level: Cells
+    slope_u: Cells
+    slope_v: Cells
+    misfit: Cells
+
+
+def _vote(planes: _Planes, radius: int, middle: float) -> _Vote:
+    """Nine windows: around the cell and `radius` to all sides. Each one's say is the inverse cube of its cost.
+
+    With the square edges blur, with the fourth power noise is taken out no better. The sums are separable.
+    """
+    cost = np.maximum(planes.misfit + np.float32(1e-3) / (planes.support + np.float32(1e-3)), np.float32(LEAST_COST))
+    say = 1 / (cost * cost * cost)
+    weighted_u, weighted_v = say * planes.slope_u, say * planes.slope_v
+    everywhere, turned = np.zeros((2, 2 * radius + 1), np.float32)
+    everywhere[::radius], turned[::radius] = 1, (-radius, 0, radius)
+
+    def around(field: Cells, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Cells:
+        summed: Cells = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
+        return summed
+
+    def all_of(field: Cells) -> Cells:
+        summed: Cells = np.asarray(around(field, everywhere, everywhere) + field * np.float32(ASIDE**3 - 1), np.float32)
+        return summed
+
+    total = all_of(say)
+    level = all_of(say * (planes.level - np.float32(middle)))
+    level -= around(weighted_u, turned, everywhere) + around(weighted_v, everywhere, turned)
+    scale = 1 / total
+    return _Vote(level * scale + np.float32(middle), all_of(weighted_u) * scale, all_of(weighted_v) * scale,
+                 np.log(total) * np.float32(-1 / 3))
 
 
 def spread(cells: Cells, shape: tuple[int, int]) -> Field:

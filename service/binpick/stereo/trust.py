@@ -1,8 +1,9 @@
-"""What is measured: how likely each match is wrong, and its sigma if it is not, by two laws of the evidence.
+"""What is measured: how likely each match is wrong, and its sigma if it is not, both told from the evidence.
 
-One gives the log-odds of an error beyond 1 px, the other the log of the error's size. Where one surface is seen both are
-linear; between two surfaces they are quadratic and have weights of their own: "which of the two?" is no question elsewhere. The
-weights were fitted on the exam's tuning seeds by `lab/fit.py`; `binpick bench stereo` says how well they hold.
+One figure is the log-odds of an error beyond 1 px, the other the log of the error's size. The odds of a surface seen alone are
+linear in the evidence, so that they mean something on images unlike those they were fitted on; the rest are small networks:
+between two surfaces "which of the two?" is no linear question, nor is what adds to an error. The weights were fitted on the
+exam's tuning seeds by `lab/fit.py`; `binpick bench stereo` says how well they hold.
 """
 
 import math
@@ -14,11 +15,13 @@ from jaxtyping import Float32, Int
 
 from binpick.data import Disparity, Mask
 from binpick.stereo.evidence import Evidence
-from binpick.stereo.refine import spread
-from binpick.stereo.weights import Law, Model
+from binpick.stereo.refine import mean_of_four, spread
+from binpick.stereo.weights import Model, Network
 
 LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.02, 3.0
 """Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what the law was fitted on."""
+BLOCK = 1024
+"""Columns that are taken through a network at a time: they stay in the cache, and so few BLAS never shares among threads."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,17 +33,16 @@ class Trust:
 
 
 def judge(evidence: Evidence, model: Model) -> Trust:
-    """What the evidence says of every pixel, by the laws fitted at its resolution."""
+    """What the evidence says of every pixel, by what was fitted at its resolution."""
+    shape, cells = (evidence.two.shape[0], evidence.two.shape[1]), evidence.cells
+    constant = np.full(cells.shape[1:], model.wrong.constant, np.float32)
+    odds = _sum(evidence.pixels, model.wrong.pixels, spread(_sum(cells, model.wrong.cells, constant), shape))
+    means = np.concatenate([np.stack([mean_of_four(plane) for plane in evidence.pixels]), cells])
+    log_sigma = spread(_answer(model.sigma, means.reshape(len(means), -1)).reshape(cells.shape[1:]), shape)
     between = np.flatnonzero(evidence.two)
     contested = _at(evidence, between)
-    fields = []
-    for alone, contest in ((model.alone.wrong, model.between.wrong), (model.alone.sigma, model.between.sigma)):
-        constant = np.full(evidence.cells.shape[1:], alone.constant, np.float32)
-        of_cells = spread(_sum(evidence.cells, alone.cells, constant), (evidence.two.shape[0], evidence.two.shape[1]))
-        field = _sum(evidence.pixels, alone.pixels, of_cells)
-        field.ravel()[between] = _contest(contested, contest)
-        fields.append(field)
-    odds, log_sigma = fields
+    for field, network in ((odds, model.wrong_between), (log_sigma, model.sigma_between)):
+        field.ravel()[between] = _answer(network, contested)
     return Trust(odds, np.clip(cv2.exp(log_sigma), LEAST_SIGMA_PX, MOST_SIGMA_PX))
 
 
@@ -53,16 +55,17 @@ def _at(evidence: Evidence, places: Int[np.ndarray, "k"]) -> Float32[np.ndarray,
                     + [plane.ravel().take(cell) for plane in evidence.cells])
 
 
-def _contest(measures: Float32[np.ndarray, "n k"], law: Law) -> Float32[np.ndarray, "k"]:
-    """The quadratic law, summed in a fixed order."""
-    total = np.full(measures.shape[1], law.constant, np.float32)
-    pairs = iter(law.pairs)
-    for i, (measure, weight) in enumerate(zip(measures, law.pixels + law.cells, strict=True)):
-        factor = np.full_like(measure, weight)
-        for other in measures[i:] if law.pairs else ():
-            factor += other * np.float32(next(pairs))
-        total += measure * factor
-    return total
+def _answer(network: Network, measures: Float32[np.ndarray, "n k"]) -> Float32[np.ndarray, "k"]:
+    """The network's figure for every column."""
+    hidden, offsets, out = (np.array(weights, np.float32) for weights in (network.hidden, network.offsets, network.out))
+    answer = np.empty(measures.shape[1], np.float32)
+    for begin in range(0, len(answer), BLOCK):
+        block = slice(begin, begin + BLOCK)
+        active = hidden @ measures[:, block]
+        active += offsets[:, None]
+        np.matmul(out, np.maximum(active, 0, out=active), out=answer[block])
+    answer += np.float32(network.constant)
+    return answer
 
 
 def _sum(planes: Float32[np.ndarray, "n h w"], weights: tuple[float, ...], total: Float32[np.ndarray, "h w"],
