@@ -42,7 +42,7 @@ def test_a_network_finds_a_bend_that_no_line_has() -> None:
     planted = 2 * np.abs(x[:, 1] - 1) - 1
     wrong = np.random.default_rng(2).uniform(size=len(x)) < 1 / (1 + np.exp(-planted))
     told = fit._answers(fit.network(x, fit.likelihood(wrong)), x)
-    assert np.abs(told - planted).mean() < 0.15
+    assert np.abs(told - planted).mean() < 0.2, "a line is .5 off"
     assert np.corrcoef(x[:, 1], planted)[0, 1] ** 2 < 0.01
 
 

@@ -1,11 +1,11 @@
-"""Fits the laws of `stereo.trust` on the exam's tuning seeds and writes `stereo/weights.py`: `make fit`."""
+"""Fits the law and the networks of `stereo.trust` on the exam's tuning seeds and writes `stereo/weights.py`: `make fit`."""
 
 import dataclasses
 import math
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,13 @@ from binpick.stereo import evidence, filter, pyramid, refine, search, weights
 
 LESSONS = (("A", range(1, 11)), ("B", range(1, 11)))
 """World and seeds. Steel and scenes without the projector taught nothing but to distrust the others."""
+BARE = (20.0, 60.0, 100.0, 140.0, 180.0, 220.0)
+"""Grey levels of surfaces that show nothing but sensor noise: whatever is matched there is wrong, and no scene says so."""
 OFF_PX = 1.0
 """An error beyond this is what `wrong` means."""
 WITHIN, WITHIN_TWICE = 0.69, 0.945
 """Shares of errors below sigma and below twice sigma: between the normal law's and what heavier tails leave of it."""
-ALONE, BETWEEN = 20_000, 10_000
+ALONE, BETWEEN = 15_000, 8_000
 """Pixels that a scene teaches at most, of each kind: as many in either world, however large its parts appear."""
 HIDDEN = 12
 """Rectifiers of a network; 16 told no more, 8 a little less."""
@@ -61,6 +63,7 @@ class Scene:
 
 def lessons(seeds: int) -> Iterator[tuple[Scene, Scene]]:
     """What the tuning scenes teach at full and at half resolution; `seeds` limits how many of each kind."""
+    yield from _bare(depths.rectified(exam.paper("A", 1))[0])
     quality, fast = PRESETS["quality"], PRESETS["fast"]
     for world, some in LESSONS:
         for seed in some[:seeds]:
@@ -74,6 +77,21 @@ def lessons(seeds: int) -> Iterator[tuple[Scene, Scene]]:
             coarse = np.where(np.abs(mean - nearest) < 2 * pyramid.SAME_SURFACE_PX, mean, nearest)
             yield (_scene(pair, quality, refine.FULL, target, part, 1),
                    _scene(pyramid.shrink(pair), fast, refine.HALF, coarse, part[:rows:2, :cols:2], 2))
+
+
+def _bare(like: Rectified) -> Iterator[tuple[Scene, Scene]]:
+    """Surfaces without any texture, in a window like that of a pair."""
+    quality, fast = PRESETS["quality"], PRESETS["fast"]
+    for seed, level in enumerate(BARE):
+        spread = math.sqrt((evidence.NOISE_VARIANCE + evidence.NOISE_PER_STEP * level) / 2)
+        noise = np.random.default_rng(seed).normal(level, spread, (2, *like.left.shape))
+        left, right = np.clip(np.round(noise), 0, 255).astype(np.uint8)
+        pair = replace(like, left=left, right=right)
+        small = pyramid.shrink(pair)
+        whole, half = ((window.height, window.width) for window in (pair.window, small.window))
+        nowhere = np.float32(2 * like.window.num_disparities)
+        yield (_scene(pair, quality, refine.FULL, np.full(whole, nowhere), np.ones(whole, dtype=bool), 1),
+               _scene(small, fast, refine.HALF, np.full(half, 2 * nowhere), np.ones(half, dtype=bool), 2))
 
 
 def _scene(pair: Rectified, settings: StereoSettings, reach: refine.Reach, target: Float32[np.ndarray, "h w"],
@@ -164,7 +182,7 @@ def _law(planes: Float32[np.ndarray, "m n"], wrong: Bool[np.ndarray, "m"]) -> tu
 
     solved = minimize(loss, np.zeros(x.shape[1] + 1), jac=True, method="L-BFGS-B").x
     each, pixels = solved[1:] / scale, len(evidence.OF_PIXELS)
-    return (weights.Law(_rounded(solved[0] - each @ mean)[0], _rounded(each[:pixels]), _rounded(each[pixels:])),
+    return (weights.Law(_rounded(solved[:1] - each @ mean)[0], _rounded(each[:pixels]), _rounded(each[pixels:])),
             x @ solved[1:] + solved[0])
 
 
@@ -203,8 +221,8 @@ def _standard(planes: Float32[np.ndarray, "m n"]) -> tuple[np.ndarray, np.ndarra
     return ((planes - mean) / scale).astype(np.float32), mean, scale
 
 
-def _rounded(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(f"{value:.4g}") for value in np.atleast_1d(values))
+def _rounded(values: Float[np.ndarray, "k"]) -> tuple[float, ...]:
+    return tuple(float(f"{value:.4g}") for value in values)
 
 
 def text(full: weights.Model, half: weights.Model) -> str:

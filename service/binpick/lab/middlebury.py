@@ -51,7 +51,8 @@ def marks(scene: RealScene) -> dict[str, Any]:
 
     Left of the search range OpenCV matches nothing: `plain_sgbm_bare` gets the images as they are, as everybody calls it, and
     `plain_sgbm` with their left border repeated, as ours does. Errors compare at equal density only: `quality` is the preset as
-    it stands, `at_density_of` the same with the risk limit at which it measures as much as each of the others; `less` is there.
+    it stands, `at_density_of` the same with the risk limit at which it measures as much as each of the others; `less` is there,
+    and None where it never measures as much.
     """
     pair = scene.rectified
     matcher = plain_matcher(pair.window.num_disparities, cv2.STEREO_SGBM_MODE_SGBM)
@@ -62,7 +63,8 @@ def marks(scene: RealScene) -> dict[str, Any]:
     rows = {name: _row(scene, disparity) for name, disparity in maps.items()}
     settings = methods.five_paths(PRESETS["quality"])
     equal = {name: _at_density(scene, settings, rows[name]["density"]) for name in (methods.PLAIN, "plain_sgbm_bare")}
-    less = {name: {k: round(1 - equal[name][k] / rows[name][k], 3) if rows[name][k] else None for k in ("bad1", "bad2")}
+    less = {name: {k: round(1 - equal[name][k] / rows[name][k], 3)
+                   if rows[name][k] and equal[name]["density"] >= rows[name]["density"] else None for k in ("bad1", "bad2")}
             for name in equal}
     return {"disparities": pair.window.num_disparities, **rows, "at_density_of": equal, "less": less}
 

@@ -88,7 +88,7 @@ class StereoSettings(Strict):
     """Smoothness of the filled map."""
     wls_sigma_color: Annotated[float, Field(ge=0.1, le=10)] = 1.2
     """How strongly the filled map respects edges of the image."""
-    max_risk: Annotated[float, Field(gt=0, le=1)] = 0.46
+    max_risk: Annotated[float, Field(gt=0, le=1)] = 0.49
     """Probability of an error beyond 1 px up to which a match counts as measured."""
     speckle_px: Annotated[int, Field(ge=0, le=5000)] = 100
     """Islands of fewer pixels do not count as measured."""
@@ -96,7 +96,7 @@ class StereoSettings(Strict):
 
 PRESETS = {
     "quality": StereoSettings(matcher=Sgbm(block_px=3, p1=48, p2=280, uniqueness_percent=15)),
-    "fast": StereoSettings(matcher=Hybrid(block_px=3, p1=60, p2=400, uniqueness_percent=0), max_risk=0.58),
+    "fast": StereoSettings(matcher=Hybrid(block_px=3, p1=60, p2=400, uniqueness_percent=0), max_risk=0.63),
 }
 """What `stereo: quality` and `--preset` mean; fitted on the exam's tuning seeds."""
 
