@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import hypothesis.extra.numpy as arrays
 import hypothesis.strategies as st
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given
 
 from binpick.stereo import trust
 from binpick.stereo.evidence import OF_CELLS, OF_PIXELS, Evidence
+from binpick.stereo.strip import joined, strips
 from binpick.stereo.trust import Trust
 from binpick.stereo.weights import FULL, HALF, Law, Model, Network
 
@@ -84,10 +86,10 @@ def answer(net: Network, measures: np.ndarray) -> float:
 def test_a_network_answers_every_column_also_beyond_a_block() -> None:
     net = network(0.5, 5)
     measures = np.random.default_rng(3).uniform(-1, 1, (MEASURES, trust.BLOCK + 7)).astype(np.float32)
-    answers = trust._answer(net, measures)
+    answers = trust.answer(net, measures)
     for k in (0, 1, trust.BLOCK - 1, trust.BLOCK, trust.BLOCK + 6):
         assert answers[k] == pytest.approx(answer(net, measures[:, k]), abs=1e-5)
-    assert trust._answer(net, measures[:, :0]).shape == (0,)
+    assert trust.answer(net, measures[:, :0]).shape == (0,)
 
 
 @pytest.mark.parametrize("shape", [(10, 12), (11, 13), (2, 2)])
@@ -131,3 +133,15 @@ def test_what_was_fitted_knows_every_measure_and_the_signs_of_the_law_make_sense
     # images that differ, planes that depart or do not fit, and holes around never speak for a match
     assert min(wrong[name] for name in ("departure", "mismatch", "misfit", "holes")) > 0
     assert wrong["rival"] == 0, "where one surface is seen, it has no rival"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_strips_find_the_speckles_of_the_whole(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sound = cv2.GaussianBlur(rng.normal(size=(130, 70)), (0, 0), 2.0) > 0.02
+    disparity = np.cumsum(rng.normal(0, 0.9, sound.shape), axis=0).astype(np.float32) + 40
+    whole = trust.speckled(disparity, sound, 20)
+    pieces = ((strip.inner(trust.speckled(disparity[strip.seen], sound[strip.seen], 20)),) for strip in strips(130, 32, 20))
+    assert whole.any()
+    assert (sound & ~whole).any()
+    assert np.array_equal(joined(pieces)[0], whole)

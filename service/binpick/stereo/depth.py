@@ -13,6 +13,7 @@ from binpick.settings import StereoSettings
 from binpick.settings.stereo import Hybrid
 from binpick.stereo import evidence, filter, graycode, prefilter, pyramid, refine, search, shots, trust, weights
 from binpick.stereo.refine import Reach, Refined
+from binpick.stereo.strip import Strip, joined, strips
 from binpick.stereo.warp import warp
 from binpick.stereo.weights import Model
 
@@ -56,55 +57,38 @@ def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettin
                    right=prefilter.prefilter(rectified.right, settings.prefilter))
     whole = search.search(seen.left, seen.right, seen.window.num_disparities, matcher)
     found = np.ascontiguousarray(whole[:, rectified.margin:])
-    strips = _strips(found.shape[0])
+    cut = strips(found.shape[0], STRIP_ROWS, OVERLAP_ROWS)
     with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-strip") as pool:
         # planes need no confidence: they are fitted beside the right view's search
         confirming = pool.submit(filter.confirm, whole, seen, matcher, settings, guide)
-        refined = list(pool.map(lambda strip: refine.refine(found[strip.seen], strip.of(rectified), scale.reach), strips))
+        refined = list(pool.map(lambda rows: refine.refine(found[rows.seen], rows.of(rectified), scale.reach), cut))
         confidence, filled = confirming.result()
         judge = partial(_judged, found, confidence, rectified, scale.model, settings.max_risk)
-        disparity, sound, sigma_px = (np.concatenate(rows) for rows in zip(*pool.map(judge, strips, refined), strict=True))
-    measured = sound & ~trust.speckled(disparity, sound, settings.speckle_px)
+        disparity, sound, sigma_px = joined(pool.map(judge, cut, refined))
+        clean = partial(_cleaned, disparity, sound, settings.speckle_px)
+        measured, = joined(pool.map(clean, strips(found.shape[0], 2 * STRIP_ROWS, settings.speckle_px)))
     low, nan = np.float32(rectified.window.min_disparity), np.float32(np.nan)
-    return Depth(disparity=frozen(np.where(measured, disparity + low, nan)), filled=frozen(filled + low),
-                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(np.where(measured, sigma_px, nan)))
-
-
-@dataclass(frozen=True, slots=True)
-class _Strip:
-    """Rows `top` to `bottom` of a window, seen with those from `first` to `last`."""
-
-    first: int
-    top: int
-    bottom: int
-    last: int
-
-    @property
-    def seen(self) -> slice:
-        """All its rows."""
-        return slice(self.first, self.last)
-
-    def of(self, rectified: Rectified) -> Rectified:
-        """Those of both images."""
-        return replace(rectified, left=rectified.left[self.seen], right=rectified.right[self.seen])
-
-    def inner(self, field: np.ndarray) -> np.ndarray:
-        """Without the overlap."""
-        return field[self.top - self.first:self.bottom - self.first]
-
-
-def _strips(rows: int) -> list[_Strip]:
-    return [_Strip(max(0, top - OVERLAP_ROWS), top, min(top + STRIP_ROWS, rows), min(top + STRIP_ROWS + OVERLAP_ROWS, rows))
-            for top in range(0, rows, STRIP_ROWS)]
+    disparity += low
+    for field in (disparity, sigma_px):
+        np.copyto(field, nan, where=~measured)
+    return Depth(disparity=frozen(disparity), filled=frozen(filled + low), confidence=frozen(confidence),
+                 measured=frozen(measured), sigma_px=frozen(sigma_px))
 
 
 def _judged(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified, model: Model, max_risk: float,
-            strip: _Strip, refined: Refined) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            strip: Strip, refined: Refined) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Disparity, whether to believe it, and its sigma, of a strip."""
     pair = strip.of(rectified)
     judged = trust.judge(evidence.gather(found[strip.seen], refined, confidence[strip.seen], pair), model)
     sound = trust.believed(refined.disparity, judged, max_risk) & _textured(refined.disparity, pair)
     return strip.inner(refined.disparity), strip.inner(sound), strip.inner(judged.sigma_px)
+
+
+def _cleaned(disparity: Disparity, sound: Mask, speckle_px: int, strip: Strip) -> tuple[np.ndarray]:
+    """What is sound and no speckle, of a strip. An island that is cut off has as many pixels as the overlap has rows, so that
+    it counts as what it is: no speckle."""
+    here = sound[strip.seen]
+    return (strip.inner(here & ~trust.speckled(disparity[strip.seen], here, speckle_px)),)
 
 
 def _textured(disparity: Disparity, pair: Rectified) -> Mask:

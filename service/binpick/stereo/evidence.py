@@ -15,7 +15,8 @@ NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
 """Squared grey levels of the difference of two pixels: twice a read noise of 2, and shot noise of the brightness."""
 MOST = 5.0
 """Differences between the images count up to so many sigma of noise: beyond, something else is seen."""
-NEAR_PX, AROUND_PX = 3, 5
+NEAR_PX = 3
+AROUND = np.ones((NEAR_PX, NEAR_PX), np.uint8)
 BLOCK_CELLS, WIDE_CELLS, GLINT_CELLS, GLOSS_CELLS = 3, 5, 7, 15
 """Sides of the squares that are looked at, in pixels and in cells of 2x2 px."""
 DARK = 5.0
@@ -53,16 +54,18 @@ def gather(matched: Disparity, refined: Refined, confidence: UInt8[np.ndarray, "
     pixels = np.empty((len(OF_PIXELS), *matched.shape), np.float32)
     put = dict(zip(OF_PIXELS, pixels, strict=True))
     flat, deep = (np.where(known, matched, np.float32(value)) for value in (0, 4096))
-    high, low = _extremes(flat, deep, AROUND_PX)
+    high, low = flat, deep
+    for name in ("spread_near", "spread"):          # 3x3 of 3x3 is 5x5
+        high, low = cv2.dilate(high, AROUND), cv2.erode(low, AROUND)
+        np.clip(high - low, 0, MOST_JUMP_PX, out=put[name])
+    low = np.asarray(cv2.min(low, high), np.float32)
     two = np.asarray((high - low > TWO_SURFACES_PX) & known)
-    np.clip(high - low, 0, MOST_JUMP_PX, out=put["spread"])
-    near_high, near_low = _extremes(flat, deep, NEAR_PX)
-    np.clip(near_high - near_low, 0, MOST_JUMP_PX, out=put["spread_near"])
     compare = _Comparison(left, rectified.right, rectified.margin)
     seen = compare.seen(flat)
     cv2.blur(compare.unlike(seen), (NEAR_PX, NEAR_PX), dst=put["mismatch"])
     difference = cv2.blur(compare.unlike(compare.seen(high)) - compare.unlike(compare.seen(low)), (NEAR_PX, NEAR_PX))
-    np.multiply(np.where(2 * matched > high + low, difference, -difference), two, out=put["rival"])
+    np.negative(difference, out=difference, where=matched + matched <= high + low)
+    np.multiply(difference, two, out=put["rival"])
     np.fmin(refined.departure, 2, out=put["departure"])
     return Evidence(pixels, _of_cells(left, seen, known, refined, confidence), two)
 
@@ -79,26 +82,19 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
     missing = 1 - mean_of_four(known.astype(np.float32))
     cv2.blur(missing, (WIDE_CELLS, WIDE_CELLS), dst=put["holes"])
     np.multiply(255 - confidence[:2 * rows:2, :2 * cols:2], np.float32(1 / 255), out=put["unconfirmed"])
-    bright, other = mean_of_four(left), mean_of_four(seen)
-    np.multiply(cv2.blur(bright, (BLOCK_CELLS, BLOCK_CELLS)), np.float32(1 / 100), out=put["bright"])
-    np.abs(_brighter(bright, other, GLOSS_CELLS), out=put["gloss"])
-    for name, size in (("glint", GLINT_CELLS), ("glint_near", BLOCK_CELLS)):
-        change = cv2.Sobel(_brighter(bright, other, size), cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-        np.abs(np.asarray(change, np.float32), out=put[name])
+    views = mean_of_four(left), mean_of_four(seen)
+    near, around, wide = (tuple(cv2.blur(view, (size, size)) for view in views)
+                          for size in (BLOCK_CELLS, GLINT_CELLS, GLOSS_CELLS))
+    np.multiply(near[0], np.float32(1 / 100), out=put["bright"])
+    np.abs(_brighter(*wide), out=put["gloss"])
+    for name, pair in (("glint", around), ("glint_near", near)):
+        np.abs(cv2.Sobel(_brighter(*pair), cv2.CV_32F, 1, 0, ksize=1, scale=0.5), out=put[name])
     return cells
 
 
-def _brighter(bright: Cells, other: Cells, size: int) -> Cells:
-    """Log of how much brighter the left view is than the right one around."""
-    one, two = (cv2.blur(image, (size, size)) + np.float32(DARK) for image in (bright, other))
-    return np.asarray(np.log(one / two), np.float32)
-
-
-def _extremes(flat: Field, deep: Field, size: int) -> tuple[Field, Field]:
-    """Largest and smallest disparity around; 0 where nothing is matched around. Without a match `flat` is 0, `deep` a lot."""
-    kernel = np.ones((size, size), np.uint8)
-    high = np.asarray(cv2.dilate(flat, kernel), np.float32)
-    return high, np.asarray(cv2.min(cv2.erode(deep, kernel), high), np.float32)
+def _brighter(left: Cells, right: Cells) -> Cells:
+    """Log of how much brighter the left view is than the right one."""
+    return np.asarray(np.log((left + np.float32(DARK)) / (right + np.float32(DARK))), np.float32)
 
 
 class _Comparison:

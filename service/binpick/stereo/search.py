@@ -94,8 +94,8 @@ def _right_pass(left: Image, right: Image, engine: cv2.StereoMatcher) -> Dispari
 
 def _pixels(raw: Int16[np.ndarray, "h w"], num_disparities: int) -> Disparity:
     """1/16 px to px; OpenCV's mark for nothing found is one disparity outside the range, at either end."""
-    found = raw.astype(np.float32) * np.float32(1 / SCALE)
-    found[(raw < 0) | (raw >= SCALE * num_disparities)] = np.nan
+    found: Disparity = np.multiply(raw, np.float32(1 / SCALE), dtype=np.float32)
+    np.copyto(found, np.float32(np.nan), where=(raw < 0) | (raw >= SCALE * num_disparities))
     return found
 
 

@@ -19,7 +19,7 @@ from binpick.stereo.refine import mean_of_four, spread
 from binpick.stereo.weights import Model, Network
 
 LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.02, 3.0
-"""Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what the law was fitted on."""
+"""Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what it was fitted on."""
 BLOCK = 1024
 """Columns that are taken through a network at a time: they stay in the cache, and so few BLAS never shares among threads."""
 
@@ -37,35 +37,34 @@ def judge(evidence: Evidence, model: Model) -> Trust:
     shape, cells = (evidence.two.shape[0], evidence.two.shape[1]), evidence.cells
     constant = np.full(cells.shape[1:], model.wrong.constant, np.float32)
     odds = _sum(evidence.pixels, model.wrong.pixels, spread(_sum(cells, model.wrong.cells, constant), shape))
-    means = np.concatenate([np.stack([mean_of_four(plane) for plane in evidence.pixels]), cells])
-    log_sigma = spread(_answer(model.sigma, means.reshape(len(means), -1)).reshape(cells.shape[1:]), shape)
-    between = np.flatnonzero(evidence.two)
-    contested = _at(evidence, between)
+    means = np.concatenate([*(mean_of_four(plane)[None] for plane in evidence.pixels), cells])
+    log_sigma = spread(answer(model.sigma, means.reshape(len(means), -1)).reshape(cells.shape[1:]), shape)
+    v, u = np.nonzero(evidence.two)
+    contested = _at(evidence, v, u)
     for field, network in ((odds, model.wrong_between), (log_sigma, model.sigma_between)):
-        field.ravel()[between] = _answer(network, contested)
+        field[v, u] = answer(network, contested)
     return Trust(odds, np.clip(cv2.exp(log_sigma), LEAST_SIGMA_PX, MOST_SIGMA_PX))
 
 
-def _at(evidence: Evidence, places: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "n k"]:
-    """All measures at some pixels, given by their place in the raster."""
+def _at(evidence: Evidence, v: Int[np.ndarray, "k"], u: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "n k"]:
+    """All measures at some pixels, given by row and column."""
     rows, cols = evidence.cells.shape[1:]
-    v, u = np.divmod(places, evidence.two.shape[1])
-    cell = np.minimum(v // 2, rows - 1) * cols + np.minimum(u // 2, cols - 1)
-    return np.stack([plane.ravel().take(places) for plane in evidence.pixels]
+    pixel, cell = v * evidence.two.shape[1] + u, np.minimum(v >> 1, rows - 1) * cols + np.minimum(u >> 1, cols - 1)
+    return np.stack([plane.ravel().take(pixel) for plane in evidence.pixels]
                     + [plane.ravel().take(cell) for plane in evidence.cells])
 
 
-def _answer(network: Network, measures: Float32[np.ndarray, "n k"]) -> Float32[np.ndarray, "k"]:
-    """The network's figure for every column."""
+def answer(network: Network, measures: Float32[np.ndarray, "n k"]) -> Float32[np.ndarray, "k"]:
+    """The network's figure for every column of measures."""
     hidden, offsets, out = (np.array(weights, np.float32) for weights in (network.hidden, network.offsets, network.out))
-    answer = np.empty(measures.shape[1], np.float32)
-    for begin in range(0, len(answer), BLOCK):
+    figures = np.empty(measures.shape[1], np.float32)
+    for begin in range(0, len(figures), BLOCK):
         block = slice(begin, begin + BLOCK)
         active = hidden @ measures[:, block]
         active += offsets[:, None]
-        np.matmul(out, np.maximum(active, 0, out=active), out=answer[block])
-    answer += np.float32(network.constant)
-    return answer
+        np.matmul(out, np.maximum(active, 0, out=active), out=figures[block])
+    figures += np.float32(network.constant)
+    return figures
 
 
 def _sum(planes: Float32[np.ndarray, "n h w"], weights: tuple[float, ...], total: Float32[np.ndarray, "h w"],
