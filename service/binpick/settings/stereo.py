@@ -96,7 +96,7 @@ class StereoSettings(Strict):
 
 PRESETS = {
     "quality": StereoSettings(matcher=Sgbm(block_px=3, p1=48, p2=280, uniqueness_percent=15)),
-    "fast": StereoSettings(matcher=Hybrid(block_px=3, p1=60, p2=400, uniqueness_percent=0), max_risk=0.63),
+    "fast": StereoSettings(matcher=Hybrid(block_px=3, p1=60, p2=400, uniqueness_percent=0), max_risk=0.56),
 }
 """What `stereo: quality` and `--preset` mean; fitted on the exam's tuning seeds."""
 
