@@ -9,7 +9,8 @@ from jaxtyping import Float, UInt8
 from binpick import geometry
 from binpick.data import Image, OrganisedCloud, Rectified
 from binpick.geometry import Points, Transform
-from binpick.result import CycleInput, CycleResult, GraspMessage, PoseMessage, ReturnCode, Triple
+from binpick.message import PoseMessage, Triple
+from binpick.result import CycleInput, CycleResult, GraspMessage, ReturnCode
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Colour = tuple[int, int, int]
