@@ -215,8 +215,9 @@ def _bin(job: Job, frames: "_Frames", filled: load_carrier.Filling | None) -> Bi
 def _rim(found: Location | None) -> RimMessage | None:
     if found is None:
         return None
-    x, y, z = found.T_expected_bin[:3, 3].tolist()
-    return RimMessage(seen=found.seen, rms_m=found.rms_m, shift_m=(x, y, z), yaw_rad=found.yaw_rad, tilt_rad=found.tilt_rad)
+    (a, b, c, d), (x, y, z) = found.seen.there.tolist(), found.T_expected_bin[:3, 3].tolist()
+    return RimMessage(seen=(a, b, c, d), rms_m=found.seen.rms_m, shift_m=(x, y, z), yaw_rad=found.yaw_rad,
+                      tilt_rad=found.tilt_rad)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Where the bin really stands: looked for near where it is expected, and refused unless it is the bin of the model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -11,7 +11,7 @@ from binpick import geometry
 from binpick.data import Cloud
 from binpick.errors import Code
 from binpick.geometry import Transform, Vector
-from binpick.scene.rim import Points, Rim, Shares
+from binpick.scene.rim import Points, Rim, Seen, Shares
 from binpick.settings import Bin
 
 SHIFT_M, HEIGHT_M, YAW_RAD, TILT_RAD = 0.030, 0.010, np.radians(10.0), np.radians(3.0)
@@ -22,8 +22,10 @@ BAND_M = 0.040
 """Points this far above or below the expected rim may show it: a tilted bin's is 30 mm off in a corner."""
 ROW_STEP, COLUMN_STEP = 3, 2
 """One pixel in so many: a rim of 3 mm is still seen twice across at 2 px per mm."""
-LEAST_SEEN = 0.30
+LEAST_SEEN = 0.20
 """A side of which less is seen is not there."""
+MOST_PASSED = 0.10
+"""Nor is one beyond which the bin's content goes on along so much of it."""
 SIDES = ("-x", "+x", "-y", "+y")
 FLOOR_WITHIN_M = 0.005
 """A floor further from the model's is another bin's."""
@@ -39,13 +41,11 @@ FLOOR_MARGIN_M = 0.008
 class Location:
     """A bin as located, and how good the evidence is.
 
-    `seen` are the shares of the sides at −x, +x, −y, +y that lie where the model has them; `rms_m` is how far their points
-    are off. `fault` is None when this is the bin of the model, within the tolerances; else `message` says what is wrong.
+    `fault` is None when this is the bin of the model, within the tolerances; else `message` says what is wrong.
     """
 
     T_expected_bin: Transform
-    seen: Shares
-    rms_m: float
+    seen: Seen
     fault: Code | None = None
     message: str = ""
 
@@ -78,35 +78,42 @@ def locate(xyz_camera: Cloud, model: Bin, T_camera_expected: Transform) -> Locat
     height = cv2.transform(cloud.reshape(-1, 1, 3), T_expected_camera[2:3]).ravel()
     points = geometry.transform(T_expected_camera, cloud[np.abs(height - np.float32(model.inner_size_m[2])) < BAND_M])
     rim = Rim.of(model, T_expected_camera[:3, 3])
-    best = Location(np.eye(4), (0.0, 0.0, 0.0, 0.0), 0.0)
+    best = Location(np.eye(4), Seen(np.zeros(4), np.zeros(4), 0.0))
     for start in rim.starts(points, SHIFT_M, YAW_RAD):
         T_expected_bin = rim.fit(points, start)
-        found = Location(T_expected_bin, *rim.seen(points, T_expected_bin))
-        if sum(found.seen) > sum(best.seen):
+        found = Location(T_expected_bin, rim.seen(points, T_expected_bin))
+        if found.seen.there.sum() > best.seen.there.sum():
             best = found
-        if min(found.seen) >= LEAST_SEEN:
+        if found.seen.there.min() >= LEAST_SEEN and found.seen.passed.max() < MOST_PASSED:
             break
     T_bin_camera = geometry.inverse(best.T_expected_bin) @ T_expected_camera
     fault, message = _fault(best) or _floor_fault(cloud[::FLOOR_STEP], model, T_bin_camera) or (None, "")
-    return Location(best.T_expected_bin, best.seen, best.rms_m, fault, message)
+    return replace(best, fault=fault, message=message)
 
 
 def _fault(found: Location) -> tuple[Code, str] | None:
     """What speaks against the bin of the model standing there, within the tolerances."""
-    sides = sum(share >= LEAST_SEEN for share in found.seen)
-    shares = ", ".join(f"{100 * share:.0f} % at {side}" for side, share in zip(SIDES, found.seen, strict=True))
+    sides = int((found.seen.there >= LEAST_SEEN).sum())
+    shares = _told(found.seen.there)
     if sides < 2:
         return Code.BIN_NOT_FOUND, f"No rim was seen where the bin is expected: {shares}."
     if sides < 4:
         return Code.BIN_MISMATCH, f"The rim is not where the bin's model has it: {shares}."
+    if found.seen.passed.max() >= MOST_PASSED:
+        return Code.BIN_MISMATCH, ("Things as high as the rim go on beyond it: the bin is larger than its model, or something "
+                                   f"stands against it: {_told(found.seen.passed)}.")
     if found.tilt_rad > SLACK * np.sqrt(2) * TILT_RAD:
         return Code.BIN_MISMATCH, f"The bin is tilted by {np.degrees(found.tilt_rad):.1f} degrees."
     x, y, z = found.T_expected_bin[:3, 3]
     if (max(abs(x), abs(y)) > SLACK * SHIFT_M or abs(z) > HEIGHT_M + np.sqrt(2) * SHIFT_M * TILT_RAD
             or abs(found.yaw_rad) > SLACK * YAW_RAD):
-        return Code.BIN_NOT_FOUND, (f"The bin stands too far from where it is expected: by {round(1000 * x)}, {round(1000 * y)} "
-                                    f"and {round(1000 * z)} mm, turned by {round(np.degrees(found.yaw_rad))} degrees.")
+        return Code.BIN_NOT_FOUND, (f"The bin stands too far from where it is expected: by {round(1000 * x)}, "
+                                    f"{round(1000 * y)} and {round(1000 * z)} mm, turned by {round(np.degrees(found.yaw_rad))} degrees.")
     return None
+
+
+def _told(shares: Shares) -> str:
+    return ", ".join(f"{100 * share:.0f} % at {side}" for side, share in zip(SIDES, shares, strict=True))
 
 
 def _floor_fault(xyz_camera: Points, model: Bin, T_bin_camera: Transform) -> tuple[Code, str] | None:

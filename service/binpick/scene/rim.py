@@ -29,27 +29,42 @@ GROUP_POINTS = 300
 """Points of one side's top or wall that take part in the fit."""
 WITHIN_M = 0.003
 """A point this near the model's rim shows it."""
+BEYOND_M = (0.004, 0.025)
+"""So far outside of a rim nothing is as high; where parts of a full bin go on, there is none."""
 STRETCH_M = 0.010
-"""A side is seen as far as its stretches of this length show at least two points."""
+"""A side is seen as far as its stretches of this length show at least two points, one on top, and at most half as many beyond."""
 OUTWARDS = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
 
 Points = Float32[np.ndarray, "n 3"]
 Values = Float32[np.ndarray, "n"]
 Index = Int[np.ndarray, "n"]
-Shares = tuple[float, float, float, float]
+Shares = Float64[np.ndarray, "4"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Offsets:
     """Signed distances of points to the rim: from its top's height, else sideways from an edge or wall; inf: above or below.
 
-    `side` is the nearest: 0 to 3 at −x, +x, −y, +y; `along` is the place along it.
+    `side` is the nearest: 0 to 3 at −x, +x, −y, +y; `along` is the place along it; `beyond`: higher than things stand outside.
     """
 
     distance: Values
     on_top: Bool[np.ndarray, "n"]
+    beyond: Bool[np.ndarray, "n"]
     side: Index
     along: Values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Shares of the four sides: seen where the model has them, or passed by things as high; the rest was not measured.
+
+    `rms_m` is the distance of the points that show them.
+    """
+
+    there: Shares
+    passed: Shares
+    rms_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +91,8 @@ class Rim:
         # at the top's own height, what lies beside it tells where its edge is
         beside = outward - np.where(below, self.face_m[side], np.where(outward > wall_m, wall_m, np.float32(0)))
         near = (above > -SKIRT_M) & (above < GATES_M[0])
-        return Offsets(np.where(near, np.where(on_top, above, beside), np.float32(np.inf)), on_top, side, along)
+        beyond = near & (outward > wall_m + BEYOND_M[0]) & (outward < wall_m + BEYOND_M[1])
+        return Offsets(np.where(near, np.where(on_top, above, beside), np.float32(np.inf)), on_top, beyond, side, along)
 
     def starts(self, points: Points, shift_m: float, yaw_rad: float) -> Iterator[Transform]:
         """Poses T_frame_bin to start the fit from, best first: where most of the outline is occupied, seen from above.
@@ -115,19 +131,25 @@ class Rim:
             T_frame_bin = T_frame_bin @ geometry.inverse(moved)
         return T_frame_bin
 
-    def seen(self, points: Points, T_frame_bin: Transform) -> tuple[Shares, float]:
-        """Which share of each side was seen there, and the rms distance of the points that show it."""
+    def seen(self, points: Points, T_frame_bin: Transform) -> Seen:
+        """What of the rim was seen there."""
         offsets = self.offsets(geometry.transform(geometry.inverse(T_frame_bin), points))
         shows = np.abs(offsets.distance) < WITHIN_M
-        a, b, c, d = (self._share(offsets.along[shows & (offsets.side == side)], side) for side in range(4))
+        there, passed = np.empty(4), np.empty(4)
+        for side in range(4):
+            on, top, past = (self._count(offsets, chosen, side) for chosen in (shows, shows & offsets.on_top, offsets.beyond))
+            goes_on = (past >= 2) & (2 * past > on)
+            there[side], passed[side] = np.mean((on >= 2) & (top >= 1) & ~goes_on), np.mean(goes_on)
         rms_m = float(np.sqrt(np.mean(offsets.distance[shows].astype(float) ** 2))) if shows.any() else 0.0
-        return (a, b, c, d), rms_m
+        return Seen(there, passed, rms_m)
 
-    def _share(self, along: Values, side: int) -> float:
+    def _count(self, offsets: Offsets, chosen: Bool[np.ndarray, "n"], side: int) -> Int[np.ndarray, "k"]:
+        """How many of the chosen points lie along each stretch of a side."""
         side_m = self.size_m[1 if side < 2 else 0]
         count = max(1, round(side_m / STRETCH_M))
+        along = offsets.along[chosen & (offsets.side == side)]
         index = np.floor((along / np.float32(side_m) + np.float32(0.5)) * count).astype(np.int64)
-        return float((np.bincount(index[(index >= 0) & (index < count)], minlength=count) >= 2).mean())
+        return np.bincount(index[(index >= 0) & (index < count)], minlength=count)
 
     def _places(self, q: Points) -> tuple[Values, Index, Values]:
         """How far beyond the nearest wall's inner face points lie, which side's that is, and how far along it."""
