@@ -22,10 +22,10 @@ BAND_M = 0.040
 """Points this far above or below the expected rim may show it: a tilted bin's is 30 mm off in a corner."""
 ROW_STEP, COLUMN_STEP = 3, 2
 """One pixel in so many: a rim of 3 mm is still seen twice across at 2 px per mm."""
-LEAST_SEEN = 0.20
-"""A side of which less is seen is not there."""
-MOST_PASSED = 0.10
-"""Nor is one beyond which the bin's content goes on along so much of it."""
+WELL_SEEN, LEAST_SEEN = 0.50, 0.10
+"""Two sides at least must be seen so well for anything to be found, and each so well that it is known to be there."""
+MOST_PASSED = 0.15
+"""A side is not there if its content goes on beyond it along more than this share of what is seen of it."""
 SIDES = ("-x", "+x", "-y", "+y")
 FLOOR_WITHIN_M = 0.005
 """A floor further from the model's is another bin's."""
@@ -84,7 +84,7 @@ def locate(xyz_camera: Cloud, model: Bin, T_camera_expected: Transform) -> Locat
         found = Location(T_expected_bin, rim.seen(points, T_expected_bin))
         if found.seen.there.sum() > best.seen.there.sum():
             best = found
-        if found.seen.there.min() >= LEAST_SEEN and found.seen.passed.max() < MOST_PASSED:
+        if found.seen.there.min() >= LEAST_SEEN and not (found.seen.passed > MOST_PASSED * found.seen.there).any():
             break
     T_bin_camera = geometry.inverse(best.T_expected_bin) @ T_expected_camera
     fault, message = _fault(best) or _floor_fault(cloud[::FLOOR_STEP], model, T_bin_camera) or (None, "")
@@ -93,22 +93,22 @@ def locate(xyz_camera: Cloud, model: Bin, T_camera_expected: Transform) -> Locat
 
 def _fault(found: Location) -> tuple[Code, str] | None:
     """What speaks against the bin of the model standing there, within the tolerances."""
-    sides = int((found.seen.there >= LEAST_SEEN).sum())
-    shares = _told(found.seen.there)
-    if sides < 2:
-        return Code.BIN_NOT_FOUND, f"No rim was seen where the bin is expected: {shares}."
-    if sides < 4:
-        return Code.BIN_MISMATCH, f"The rim is not where the bin's model has it: {shares}."
-    if found.seen.passed.max() >= MOST_PASSED:
+    there, passed = found.seen.there, found.seen.passed
+    if (there >= WELL_SEEN).sum() < 2:
+        return Code.BIN_NOT_FOUND, f"No rim was seen where the bin is expected: {_told(there)}."
+    if there.min() < LEAST_SEEN:
+        return Code.BIN_MISMATCH, f"The rim is not where the bin's model has it: {_told(there)}."
+    if (passed > MOST_PASSED * there).any():
         return Code.BIN_MISMATCH, ("Things as high as the rim go on beyond it: the bin is larger than its model, or something "
-                                   f"stands against it: {_told(found.seen.passed)}.")
+                                   f"stands against it: {_told(passed)}.")
     if found.tilt_rad > SLACK * np.sqrt(2) * TILT_RAD:
         return Code.BIN_MISMATCH, f"The bin is tilted by {np.degrees(found.tilt_rad):.1f} degrees."
     x, y, z = found.T_expected_bin[:3, 3]
     if (max(abs(x), abs(y)) > SLACK * SHIFT_M or abs(z) > HEIGHT_M + np.sqrt(2) * SHIFT_M * TILT_RAD
             or abs(found.yaw_rad) > SLACK * YAW_RAD):
-        return Code.BIN_NOT_FOUND, (f"The bin stands too far from where it is expected: by {round(1000 * x)}, "
-                                    f"{round(1000 * y)} and {round(1000 * z)} mm, turned by {round(np.degrees(found.yaw_rad))} degrees.")
+        mm, degrees = [round(1000 * shift) for shift in (x, y, z)], round(np.degrees(found.yaw_rad))
+        return Code.BIN_NOT_FOUND, (f"The bin stands too far from where it is expected: by {mm[0]}, {mm[1]} and {mm[2]} mm, "
+                                    f"turned by {degrees} degrees.")
     return None
 
 

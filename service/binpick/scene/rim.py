@@ -32,7 +32,7 @@ WITHIN_M = 0.003
 BEYOND_M = (0.004, 0.025)
 """So far outside of a rim nothing is as high; where parts of a full bin go on, there is none."""
 STRETCH_M = 0.010
-"""A side is seen as far as its stretches of this length show at least two points, one on top, and at most half as many beyond."""
+"""A side is seen where a stretch of this length shows two points, one of them on top, and at most half as many beyond."""
 OUTWARDS = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
 
 Points = Float32[np.ndarray, "n 3"]
