@@ -132,7 +132,7 @@ def _floor_fault(xyz_camera: Points, model: Bin, T_bin_camera: Transform) -> tup
     planes = np.flatnonzero(shares > FLOOR_SHARE)
     if not len(planes):
         return None
-    level = float(edges[planes[0] + 1])
+    level = float(np.median(z[np.abs(z - edges[planes[0] + 1]) < FLOOR_WITHIN_M]))
     glimpsed = float(np.mean(np.abs(z) < FLOOR_WITHIN_M)) > FLOOR_GLIMPSE
     if -FLOOR_WITHIN_M <= level <= FLOOR_WITHIN_M or (level > 0 and glimpsed):
         return None

@@ -194,11 +194,11 @@ class Rim:
         up = np.array([0.0, 0.0, height])
         return geometry.make(R, flat[:3, 3] + up + np.array([0.0, 0.0, lift]) - R @ up)
 
-    def _fair(self, points: Points, T_frame_bin: Transform) -> Points:
+    def _fair(self, points: Points, T_frame_bin: Transform) -> Float32[np.ndarray, "m 3"]:
         """The points near the rim, of each side's top and wall alike many at most: a well-seen wall must not outvote a rim."""
         offsets = self.offsets(geometry.transform(geometry.inverse(T_frame_bin), points))
         near = np.abs(offsets.distance) < GATES_M[0]
         groups = [np.flatnonzero(near & (offsets.side == side) & (offsets.on_top == top))
                   for side in range(4) for top in (False, True)]
-        chosen: Points = points[np.concatenate([group[::max(1, len(group) // GROUP_POINTS)] for group in groups])]
-        return chosen
+        chosen = np.concatenate([group[::max(1, len(group) // GROUP_POINTS)] for group in groups])
+        return np.asarray(points[chosen])
