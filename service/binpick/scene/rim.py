@@ -23,9 +23,11 @@ CELL_M = 0.004
 """Edge of the cells in which the search for a start counts points."""
 YAW_STEP_RAD = np.radians(1.5)
 """Yaws tried: ends of a side of 0.6 m then are off by less than two cells."""
-GATES_M = (0.012, 0.009, 0.006, 0.004, 0.003, 0.003, 0.003)
+GATES_M = (0.012, 0.012, 0.012, 0.009, 0.006, 0.004, 0.003, 0.003, 0.003)
 """Of the steps of the fit: points further from the model than this do not count."""
-GROUP_POINTS = 300
+START_BELOW_M = 0.004
+"""The fit starts this much lower than the rim seems to be."""
+GROUP_POINTS = 150
 """Points of one side's top or wall that take part in the fit."""
 WITHIN_M = 0.003
 """A point this near the model's rim shows it."""
@@ -185,10 +187,11 @@ class Rim:
         rows, levels = [[0.0, 0.05, 0.0], [0.0, 0.0, 0.05]], [0.0, 0.0]
         for k in range(4):
             z = q[near & (side == k), 2]
-            if len(z) >= GROUP_POINTS / 10:
+            if len(z) >= GROUP_POINTS / 5:
                 rows.append([1.0, OUTWARDS[k, 0] * length / 2, OUTWARDS[k, 1] * width / 2])
-                # of the points of rim and wall nine in ten lie below the top; parts that lean over it aside
-                levels.append(float(np.quantile(z, 0.9)) - height)
+                # of the points of rim and wall nine in ten lie below the top; along a tilted side that is too high, and what
+                # lies above the model's top pulls it up, what lies below does not pull it down
+                levels.append(float(np.quantile(z, 0.9)) - height - START_BELOW_M)
         lift, slope_x, slope_y = np.linalg.lstsq(np.array(rows), np.array(levels), rcond=None)[0]
         R = turn @ Rotation.from_rotvec([np.arctan(slope_y), -np.arctan(slope_x), 0.0]).as_matrix()
         up = np.array([0.0, 0.0, height])
