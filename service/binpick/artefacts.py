@@ -9,7 +9,8 @@ from jaxtyping import Float, UInt8
 from binpick import geometry
 from binpick.data import Image, OrganisedCloud, Rectified
 from binpick.geometry import Points, Transform
-from binpick.result import CycleInput, CycleResult, GraspMessage, PoseMessage, ReturnCode, Triple
+from binpick.message import PoseMessage, Triple
+from binpick.result import CycleInput, CycleResult, GraspMessage, ReturnCode
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Colour = tuple[int, int, int]
@@ -18,6 +19,7 @@ NOT_MEASURED: Colour = (48, 46, 44)
 INK: Colour = (244, 240, 236)
 BANNER: dict[str, Colour] = {"poses": (84, 130, 34), "none": (30, 118, 186), "failed": (44, 44, 170)}
 BIN: Colour = (196, 176, 84)
+EXPECTED: Colour = (64, 96, 250)
 SHADOW: Colour = (20, 20, 20)
 BEST: Colour = (96, 220, 96)
 OTHERS: Colour = (64, 176, 250)
@@ -84,7 +86,9 @@ def _overlay(inputs: CycleInput, cycle: CycleResult) -> bytes:
     if cycle.segments is not None:
         picture = _tinted(picture, cycle.segments.parts)
     if result.bin is not None and result.bin.T_camera_bin is not None:
-        _draw_bin(picture, cycle.rectified, _transform(result.bin.T_camera_bin), inputs.job.bin.inner_size_m)
+        _draw_bin(picture, cycle.rectified, _transform(result.bin.T_camera_bin), inputs.job.bin.inner_size_m, BIN)
+    elif (T_camera_expected := _expected(inputs)) is not None:
+        _draw_bin(picture, cycle.rectified, T_camera_expected, inputs.job.bin.inner_size_m, EXPECTED)
     T_camera_frame = {"camera": np.eye(4)}
     if result.bin is not None and result.bin.T_camera_bin is not None:
         T_camera_frame["bin"] = _transform(result.bin.T_camera_bin)
@@ -109,7 +113,15 @@ def _tinted(picture: Picture, parts: np.ndarray) -> Picture:
     return np.ascontiguousarray(mixed)
 
 
-def _draw_bin(picture: Picture, rectified: Rectified, T_camera_bin: Transform, inner_size_m: Triple) -> None:
+def _expected(inputs: CycleInput) -> Transform | None:
+    """Where the bin was looked for."""
+    model, T_base_camera = inputs.job.bin, inputs.T_base_camera
+    if model.pose.frame == "camera":
+        return model.T_parent_bin
+    return None if T_base_camera is None else geometry.inverse(T_base_camera) @ model.T_parent_bin
+
+
+def _draw_bin(picture: Picture, rectified: Rectified, T_camera_bin: Transform, inner_size_m: Triple, colour: Colour) -> None:
     length, width, height = inner_size_m
     corners = geometry.box_corners(np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height]))
     pixels = _project(rectified, geometry.transform(T_camera_bin, corners))
@@ -117,7 +129,7 @@ def _draw_bin(picture: Picture, rectified: Rectified, T_camera_bin: Transform, i
         for axis in (1, 2, 4):  # corners are numbered by bits: x 4, y 2, z 1
             if not first & axis:
                 rim = first & 1 and axis != 1
-                _line(picture, pixels[[first, first | axis]], BIN, 2 if rim else 1)
+                _line(picture, pixels[[first, first | axis]], colour, 2 if rim else 1)
 
 
 def _draw_grasp(picture: Picture, rectified: Rectified, T_camera_frame: Transform, grasp: GraspMessage,

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -12,15 +12,14 @@ from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Seg
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.geometry import Transform
 from binpick.grasp import clearance, gate, rank, suction
+from binpick.message import BinMessage, FillCellMessage, PoseMessage, RimMessage
 from binpick.result import (
-    BinMessage,
     CycleInput,
     CycleResult,
     FrameName,
     Funnel,
     GraspMessage,
     Inputs,
-    PoseMessage,
     RecipeMessage,
     Request,
     Result,
@@ -33,6 +32,7 @@ from binpick.rig import Rig
 from binpick.scene import bin as load_carrier
 from binpick.scene import heightmap
 from binpick.scene import segment as segmentation
+from binpick.scene.location import Location, locate
 from binpick.scene.surface import surface
 from binpick.settings import Job
 from binpick.stereo import cloud, rectify
@@ -78,12 +78,16 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
            points: OrganisedCloud) -> CycleResult:
     """From depth to the answer."""
     job = inputs.job
-    T_bin_camera = geometry.inverse(frames.T_camera_bin)
+    measured = float(depth.measured.mean())
+    if job.bin.locate and measured >= LEAST_MEASURED:
+        with clock.stage("locate"):
+            frames = frames.located(locate(points.xyz, job.bin, frames.T_camera_bin))
+        if frames.location is not None and frames.location.fault is not None:
+            return CycleResult(_answer(inputs, frames, clock, frames.location.fault), rectified, depth, points)
     with clock.stage("bin"):
-        measured = float(depth.measured.mean())
-        grid = surface(depth, rectified, T_bin_camera)
+        grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin))
         heights = heightmap.height_map(grid.xyz, job.bin)
-        filled = load_carrier.filling(heights, job.bin)
+        filled = load_carrier.filling(heights, job.bin, job.recipe.part)
     seen = CycleResult(_answer(inputs, frames, clock, Code.NO_DEPTH, filled), rectified, depth, points)
     if measured < LEAST_MEASURED:
         return seen
@@ -178,7 +182,7 @@ def _code(filled: load_carrier.Filling, counts: dict[str, int], messages: tuple[
 REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "collide")
 
 
-def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling,
+def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling | None = None,
             grasps: tuple[GraspMessage, ...] = (), counts: dict[str, int] | None = None) -> Result:
     pair, job = inputs.pair, inputs.job
     worst = max(inputs.pairs, key=lambda shot: abs(shot.skew_us))
@@ -186,9 +190,8 @@ def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, 
     lost = {k: v for k, v in (counts or {}).items() if v and (k in REASONS or k.startswith("gate_"))}
     return Result(
         cycle_id=inputs.cycle_id, request=inputs.request, captured_at=pair.captured_at, simulated=inputs.simulated,
-        return_code=ReturnCode.of(code),
-        bin=BinMessage(found=True, number=job.bin.number, T_camera_bin=_pose(frames.T_camera_bin), fill_level=filled.level,
-                       coverage=filled.coverage),
+        return_code=ReturnCode.of(code, frames.location.message if frames.location is not None else ""),
+        bin=_bin(job, frames, filled),
         grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
         sync=SyncMessage(skew_us=worst.skew_us, sigma_us=worst.sigma_us, proof=worst.proof,
                          resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every)),
@@ -198,16 +201,40 @@ def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, 
                       recipe=RecipeMessage(number=job.recipe.number, name=job.recipe.name, sha256=job.recipe_sha256)))
 
 
+def _bin(job: Job, frames: "_Frames", filled: load_carrier.Filling | None) -> BinMessage:
+    """The bin in the answer. One that was to be located and was not has no pose: the expected one might be taken for it."""
+    found = frames.location.fault is None if frames.location is not None else not job.bin.locate
+    message = BinMessage(found=found, number=job.bin.number, T_camera_bin=_pose(frames.T_camera_bin) if found else None,
+                         fill_level=None, coverage=None, rim=_rim(frames.location))
+    if filled is None or not found:
+        return message
+    cells = tuple(FillCellMessage(**asdict(cell)) for cell in filled.cells)
+    return message.model_copy(update={"fill_level": filled.level, "coverage": filled.coverage, "cells": cells})
+
+
+def _rim(found: Location | None) -> RimMessage | None:
+    if found is None:
+        return None
+    (a, b, c, d), (x, y, z) = found.seen.there.tolist(), found.T_expected_bin[:3, 3].tolist()
+    return RimMessage(seen=(a, b, c, d), rms_m=found.seen.rms_m, shift_m=(x, y, z), yaw_rad=found.yaw_rad,
+                      tilt_rad=found.tilt_rad)
+
+
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """Where camera, bin and base stand to each other in this cycle."""
+    """Where camera, bin and base stand to each other in this cycle; `location` is how the bin was located, if it was to be."""
 
     T_camera_bin: Transform
     T_base_camera: Transform | None
+    location: Location | None = None
 
     @classmethod
     def of(cls, inputs: CycleInput) -> "_Frames":
         return cls(load_carrier.place(inputs.job.bin, inputs.T_base_camera), inputs.T_base_camera)
+
+    def located(self, found: Location) -> "_Frames":
+        """With the bin where its rim was found."""
+        return replace(self, T_camera_bin=self.T_camera_bin @ found.T_expected_bin, location=found)
 
     def T_frame_bin(self, frame: FrameName) -> Transform:
         """Maps bin coordinates to the frame of that name; `admit` has proved that it exists."""

@@ -25,7 +25,8 @@ from pydantic import BaseModel, ValidationError
 from binpick import __version__, rig
 from binpick.data import Frame, Image, StereoPair, frozen
 from binpick.errors import ImageError, InputError
-from binpick.result import CycleInput, Request, Result, Wire
+from binpick.message import Wire
+from binpick.result import CycleInput, Request, Result
 from binpick.settings import Job
 
 QUEUE = 2

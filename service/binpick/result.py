@@ -3,46 +3,24 @@
 A `Result` is serialised once to bytes; REST sends those, the registers are filled from the same object. Metres, radians.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from binpick import geometry
 from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.errors import Code
 from binpick.geometry import Transform
+from binpick.message import BinMessage, PoseMessage, Triple, Wire, Xyzw
 from binpick.rig import Rig
 from binpick.settings import Job
 
-Triple = tuple[float, float, float]
-Xyzw = tuple[float, float, float, float]
 FrameName = Literal["camera", "bin", "base"]
 Phase = Literal["starting", "ready", "acquiring", "computing", "stopping"]
 Source = Literal["modbus", "rest"]
 Owner = Literal["modbus", "rest", "none"]
-
-
-class Wire(BaseModel):
-    """Frozen; unknown keys and NaN are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class PoseMessage(Wire):
-    """A pose: position in metres and a unit quaternion."""
-
-    position_m: Triple
-    quaternion_xyzw: Xyzw
-
-    @field_validator("quaternion_xyzw")
-    @classmethod
-    def _unit(cls, turn: Xyzw) -> Xyzw:
-        if abs(math.hypot(*turn) - 1) > 1e-3:     # what rounding to three digits leaves
-            raise ValueError("a quaternion must have length 1 (within 0.001)")
-        return turn
 
 
 class Request(Wire):
@@ -84,16 +62,6 @@ class ReturnCode(Wire):
     def code(self) -> Code:
         """As the enum."""
         return Code(self.value)
-
-
-class BinMessage(Wire):
-    """The bin as used: its pose in the camera frame, and how full it is (0 to 1 of its height, mean over measured cells)."""
-
-    found: bool
-    number: int
-    T_camera_bin: PoseMessage | None
-    fill_level: float | None
-    coverage: float | None
 
 
 class Sigma(Wire):
@@ -185,7 +153,7 @@ class Result(Wire):
     grasps: tuple[GraspMessage, ...] = ()
     funnel: Funnel | None = None
     sync: SyncMessage | None = None
-    timing_ms: dict[str, float] = {}
+    timing_ms: dict[str, float] = Field(default_factory=dict)
     inputs: Inputs | None = None
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)

@@ -1,16 +1,20 @@
 """Planted scenes: exact depth of boxes in a bin, without images or matching."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import pytest
 
 from binpick import geometry, settings
-from binpick.data import Depth, Rectified, Window
+from binpick.data import Depth, Frame, Rectified, StereoPair, Window
 from binpick.geometry import Transform
+from binpick.result import CycleInput, Request
 from binpick.rig import Rig
+from binpick.sim import exam
+from binpick.sim.render import Renderer
+from binpick.sim.world import ScenePart, WorldScene
 from binpick.stereo import rectify
 
 CELL = """
@@ -116,3 +120,47 @@ def slab() -> type[Slab]:
 @pytest.fixture
 def window_type() -> type[Window]:
     return Window
+
+
+@pytest.fixture(scope="session")
+def photograph() -> Callable[..., CycleInput]:
+    """photograph(parts, seed): parts (kind, T_bin_part) laid into the exam's small bin, by cameras with 2 for 3 px.
+
+    That is more pixels per millimetre than over the large bin, and half the time.
+    """
+    document = exam.rig("B").model_dump(exclude={"sha256"})
+    document["image_size_px"] = tuple(int(side / 1.5) for side in exam.IMAGE_SIZE_PX)
+    for camera in document["cameras"]:
+        K = np.array(camera["K"]) / [[1.5], [1.5], [1.0]]
+        K[:2, 2] -= 1 / 6     # pixel centres are whole numbers
+        camera["K"] = K.tolist()
+    rig = Rig.model_validate(document)
+    renderer, job = Renderer(rig, "B"), settings.resolve(exam.cell("B"))
+
+    def take(parts: Sequence[tuple[str, Transform]] = (), seed: int = 1) -> CycleInput:
+        scene = WorldScene("B", tuple(ScenePart(i, kind, T) for i, (kind, T) in enumerate(parts, start=1)), seed, 1)
+        light = job.recipe.lights[0]
+        left, right = (
+            Frame(image=renderer.expose(scene, index, light, seed), camera=name, sequence=1, frame_id=1, timestamp_ns=0,
+                  triggered_ns=0, received_ns=1, exposure_us=light.exposure_us, gain_db=light.gain_db)
+            for index, name in enumerate(("left", "right")))
+        pair = StereoPair(left, right, "2026-01-01T00:00:00Z", skew_us=0.0, sigma_us=0.0, proof="simulated")
+        return CycleInput(1, pair, rig, job, Request.model_validate({"frame": "bin"}), simulated=True)
+
+    return take
+
+
+@pytest.fixture(scope="session")
+def expecting() -> Callable[..., CycleInput]:
+    """expecting(inputs, T_expected_bin, size): the same images; the bin is to be located, elsewhere, of another size."""
+
+    def move(inputs: CycleInput, T_expected_bin: Transform, size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> CycleInput:
+        model = inputs.job.bin
+        T_camera_expected = model.T_parent_bin @ geometry.inverse(T_expected_bin)
+        x, y, z = (side * factor for side, factor in zip(model.inner_size_m, size, strict=True))
+        pose = model.pose.model_copy(update={"position_m": tuple(T_camera_expected[:3, 3].tolist()),
+                                             "quaternion_xyzw": tuple(geometry.quaternion(T_camera_expected).tolist())})
+        bin_ = model.model_copy(update={"pose": pose, "locate": True, "inner_size_m": (x, y, z)})
+        return replace(inputs, job=inputs.job.model_copy(update={"bin": bin_}))
+
+    return move

@@ -143,6 +143,18 @@ def test_the_same_grasp_looks_the_same_in_every_frame(mounting: str) -> None:
     assert all((np.abs(other - shown[0]).max(axis=2) > 60).sum() <= 4 for other in shown[1:])
 
 
+def test_a_bin_that_was_not_found_is_outlined_where_it_was_expected() -> None:
+    outcome = cycle(Code.BIN_NOT_FOUND)
+    assert outcome.result.bin is not None
+    lost = outcome.result.bin.model_copy(update={"found": False, "T_camera_bin": None})
+    image = picture(artefacts.render(inputs(), replace(outcome, result=outcome.result.model_copy(update={"bin": lost})),
+                                     "overlay.png")[1])
+    found = picture(artefacts.render(inputs(), outcome, "overlay.png")[1])
+    for drawn, colour in ((image, artefacts.EXPECTED), (found, artefacts.BIN)):
+        assert (np.abs(drawn.astype(int) - colour).max(axis=2) < 40).sum() > 200
+    assert (np.abs(image.astype(int) - artefacts.BIN).max(axis=2) < 40).sum() < 20
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("code", [Code.OK, Code.BIN_EMPTY, Code.TIMEOUT])
 def test_every_artefact_exists_however_far_the_cycle_came(name: str, code: Code) -> None:

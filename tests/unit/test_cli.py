@@ -8,6 +8,7 @@ import pytest
 
 from binpick import cli
 from binpick.errors import InputError
+from binpick.sim import exam
 
 pick = importlib.import_module("binpick.cli.pick")    # the package shows the command of that name
 HEAVY = ("open3d", "nicegui", "cv2", "distributed", "mujoco", "fastapi", "uvicorn")
@@ -30,6 +31,14 @@ def test_a_fault_is_one_line_that_says_what_to_do(monkeypatch: pytest.MonkeyPatc
 def test_check_exits_with_the_worst_finding(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert call(monkeypatch, "check", "--cell", "nowhere.yaml") == 2
     assert "FAIL" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("locate", [False, True])
+def test_check_tells_which_bins_are_located(locate: bool) -> None:
+    cell = exam.cell("A")
+    bins = tuple(model.model_copy(update={"locate": locate}) for model in cell.bins)
+    finding = importlib.import_module("binpick.cli.check")._recipe(cell.model_copy(update={"bins": bins}), exam.rig("A"), 1)
+    assert ("located by its rim" in finding) is locate
 
 
 @pytest.mark.parametrize(("given", "says"), [("1 2 3", "seven numbers"), ("1 2 3 0 0 0 x", "seven numbers"),

@@ -18,6 +18,10 @@ def seen(planted):
     return heightmap.height_map(xyz_bin, planted.job.bin), surface(planted.depth, planted.rectified, planted.T_bin_camera)
 
 
+def filling(planted):
+    return load_carrier.filling(seen(planted)[0], planted.job.bin, planted.job.recipe.part)
+
+
 def segmented(planted, method="grid"):
     _, grid = seen(planted)
     return segment.segment(grid, planted.job.bin, planted.job.recipe.part, SegmentSettings(method=method))
@@ -30,16 +34,14 @@ def test_cloud_of_the_floor_lies_on_the_floor(plant):
 
 
 def test_an_empty_bin_is_proved_empty(plant):
-    heights, _ = seen(plant([], noise_px=0.2))
-    filled = load_carrier.filling(heights, plant([]).job.bin)
+    filled = filling(plant([], noise_px=0.2))
     assert filled.proved_empty
     assert filled.coverage > 0.99
 
 
 def test_an_empty_looking_bin_with_holes_is_not_proved_empty(plant):
     planted = plant([], unseen=((-0.05, 0, 0.09), (0.08, 0, 0.07)))
-    heights, _ = seen(planted)
-    filled = load_carrier.filling(heights, planted.job.bin)
+    filled = filling(planted)
     assert not filled.occupied
     assert not filled.proved_empty
 
@@ -56,12 +58,12 @@ def test_what_is_not_seen_is_as_high_as_what_surrounds_it(plant, slab):
 
 def test_a_part_above_the_rim_overfills(plant, slab):
     planted = plant([slab(0, 0, 0.06, 0.06, 0.12)])
-    assert load_carrier.filling(seen(planted)[0], planted.job.bin).overfilled
+    assert filling(planted).overfilled
 
 
 def test_mismatches_along_the_wall_neither_fill_nor_overfill(plant, slab):
     planted = plant([slab(-0.148, 0, 0.003, 0.15, 0.13)])
-    filled = load_carrier.filling(seen(planted)[0], planted.job.bin)
+    filled = filling(planted)
     assert not filled.overfilled
     assert not filled.occupied
 

@@ -119,7 +119,8 @@ def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:
     from binpick.result import Request
 
     job = settings.resolve(cell, number)
-    seen = f"{job.recipe.name}: bin {job.bin.number}, tool {job.tool.number}, poses in {job.recipe.frame}"
+    located = " (located by its rim)" if job.bin.locate else ""
+    seen = f"{job.recipe.name}: bin {job.bin.number}{located}, tool {job.tool.number}, poses in {job.recipe.frame}"
     try:
         pipeline.admit(rig, job, Request())
     except FlangePoseMissing:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from binpick.result import CycleInput, CycleResult, PoseMessage, Request
+    from binpick.message import PoseMessage
+    from binpick.result import CycleInput, CycleResult, Request
     from binpick.rig import Rig
     from binpick.settings import Cell, Job, Recipe
 
@@ -54,7 +55,7 @@ def _flange(numbers: str) -> "PoseMessage | None":
     from pydantic import ValidationError
 
     from binpick.errors import InputError
-    from binpick.result import PoseMessage
+    from binpick.message import PoseMessage
 
     if not numbers:
         return None

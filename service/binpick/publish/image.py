@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from binpick import poses
 from binpick.errors import Code, InputError
+from binpick.message import PoseMessage
 from binpick.poses import PoseFormat
 from binpick.publish.registers import (
     BLOCK,
@@ -37,7 +38,7 @@ from binpick.publish.registers import (
     Status,
     WordOrder,
 )
-from binpick.result import GraspMessage, PoseMessage, Request, Result, Snapshot
+from binpick.result import GraspMessage, Request, Result, Snapshot
 from binpick.settings import Job, Recipe
 
 Values: TypeAlias = Mapping[str, Number | None]

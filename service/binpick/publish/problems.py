@@ -10,7 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 
 from binpick.errors import BinpickError, Code
-from binpick.result import Wire
+from binpick.message import Wire
 
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger(__name__)

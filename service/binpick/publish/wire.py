@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from binpick.data import CameraStatus
-from binpick.result import Owner, Phase, Published, Snapshot, Wire
+from binpick.message import Wire
+from binpick.result import Owner, Phase, Published, Snapshot
 
 NS_PER_MS = 1_000_000
 UNKNOWN_AGE = b'\n "age_ms": null'

@@ -30,7 +30,9 @@ class Bin(Strict):
     wall_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.003
     """Wall thickness, metres."""
     pose: Pose
-    """Where it stands."""
+    """Where it stands; with `locate`: where it is expected."""
+    locate: bool = False
+    """Whether each cycle looks for its rim: within 30 mm along its sides, 10 mm in height, 10° about z, and 3° of tilt."""
 
     @property
     def T_parent_bin(self) -> Transform:

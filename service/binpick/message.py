@@ -1,0 +1,67 @@
+"""What the parts of a result share, and its bin: frozen messages, metres and radians, unknown keys and NaN refused."""
+
+import math
+
+from pydantic import BaseModel, ConfigDict, field_validator
+
+Triple = tuple[float, float, float]
+Xyzw = tuple[float, float, float, float]
+
+
+class Wire(BaseModel):
+    """Frozen; unknown keys and NaN are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class PoseMessage(Wire):
+    """A pose: position in metres and a unit quaternion."""
+
+    position_m: Triple
+    quaternion_xyzw: Xyzw
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def _unit(cls, turn: Xyzw) -> Xyzw:
+        if abs(math.hypot(*turn) - 1) > 1e-3:     # what rounding to three digits leaves
+            raise ValueError("a quaternion must have length 1 (within 0.001)")
+        return turn
+
+
+class RimMessage(Wire):
+    """How a bin was located: the shares of its sides (at −x, +x, −y, +y) seen where its model has them, the rms distance of
+
+    the points that show them, and where it stands from where it is expected: shift along the expected axes, yaw, tilt.
+    """
+
+    seen: tuple[float, float, float, float]
+    rms_m: float
+    shift_m: Triple
+    yaw_rad: float
+    tilt_rad: float
+
+
+class FillCellMessage(Wire):
+    """The fill of a rectangle of the bin's floor: middle and size in its frame; level null where nothing was measured."""
+
+    x_m: float
+    y_m: float
+    size_m: tuple[float, float]
+    level: float | None
+    coverage: float
+
+
+class BinMessage(Wire):
+    """The bin as used: its pose in the camera frame, and how full it is (0 to 1 of its height, mean over measured cells).
+
+    `found` is false, and there is no pose, when it was to be located and was not, or is not the bin of its model; `rim` says
+    how well it was located, null when its pose is configured.
+    """
+
+    found: bool
+    number: int
+    T_camera_bin: PoseMessage | None
+    fill_level: float | None
+    coverage: float | None
+    cells: tuple[FillCellMessage, ...] = ()
+    rim: RimMessage | None = None
