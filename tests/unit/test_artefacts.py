@@ -24,7 +24,7 @@ from binpick.result import (
     ToolMessage,
 )
 from binpick.rig import Rig
-from binpick.settings import Bin, Job, Pose, Recipe, Tool
+from binpick.settings import Bin, Job, Pose, Recipe, SuctionTool
 
 WIDTH, HEIGHT, MARGIN, FOCAL = 400, 300, 32, 500.0
 STRIP = round(WIDTH * 0.055)
@@ -48,7 +48,7 @@ def inputs(request: Request | None = None, **hand_eye: object) -> CycleInput:
     rig = Rig.model_validate({"image_size_px": (440, 320), "cameras": [
         {"name": name, "K": ((FOCAL, 0, 220), (0, FOCAL, 160), (0, 0, 1)), "distortion": (0, 0, 0, 0),
          "T_cam_rig": rows(geometry.translation(x, 0.0, 0.0))} for name, x in (("left", 0.0), ("right", -0.15))], **hand_eye})
-    job = Job(recipe=Recipe(), bin=Bin(inner_size_m=(0.4, 0.3, 0.1), pose=Pose(position_m=(0, 0, 1))), tool=Tool())
+    job = Job(recipe=Recipe(), bin=Bin(inner_size_m=(0.4, 0.3, 0.1), pose=Pose(position_m=(0, 0, 1))), tools=(SuctionTool(),))
     pair = StereoPair(frames[0], frames[1], "2026-01-02T03:04:05.678Z", 0.0, 0.0, "none")
     return CycleInput(3, pair, rig, job, request or Request())
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from binpick import geometry
-from binpick.settings import Tool
+from binpick.settings import SuctionTool
 from binpick.sim import score
 from binpick.sim.world import ScenePart, WorldScene
 
 TOP = 0.015
-TOOL = Tool()
+TOOL = SuctionTool()
 BLOCK = WorldScene("A", (ScenePart(3, "block", geometry.translation(0.1, 0.05, 0.0075)),), 1, 1)
 
 
