@@ -7,7 +7,7 @@ its principal axes. What is measured of it gives the width; the watertight heigh
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from binpick import geometry
 from binpick.data import Grasp, Segments
@@ -16,7 +16,7 @@ from binpick.grasp.clearance import Obstacles
 from binpick.grasp.slices import Slices
 from binpick.settings import Fingers, TwoFingerTool
 
-GRIPS = (0.75, 0.5, 0.33, 0.22)
+GRIPS = (0.22, 0.33, 0.5, 0.75)
 """How far the fingertips reach below the ends of a slice, in pad depths; the deepest free one is taken."""
 GAPS_M = (0.008, 0.005, 0.003)
 """Room left on either side of the part on the way in; the widest free one is taken."""
@@ -26,10 +26,12 @@ MAX_RESIDUAL_M = 0.0015
 """How far the ends of the strips may leave the straight line through them."""
 DOUBTS = {"angle": 0.4, "wedge": 0.3, "uneven": 0.3, "shallow": 0.3, "tight": 0.2}
 """What each doubt may take away of a grasp's quality at most."""
-PITCH_M = 0.0025
+PITCH_M = 0.003
 """Distance of the points that stand for a fingertip: about a cell of the height map."""
 LEVEL_M = 0.012
-"""Distance of the fingers' cross-sections that are looked at above their tips."""
+"""Steps of the fingertips on their way down to the ends of a slice."""
+PER_AXIS = 3
+"""Grasps kept of the slices along one axis of one patch."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,8 +60,10 @@ def candidates(segments: Segments, tool: TwoFingerTool, sigma_z_m: np.ndarray, s
     free = np.flatnonzero(room.grip > 0)
     reasons |= {"no_room": len(cut.part) - len(free), "pinched": len(free)}
     doubt = _doubt(cut, room)
-    sigma = float(np.nanmedian(sigma_z_m)) if np.isfinite(sigma_z_m).any() else 0.0
-    return [_grasp(i, cut, room, float(doubt[i]), tool, sigma) for i in free.tolist()], reasons
+    best = _best(cut, doubt, free)
+    parts = segments.parts.ravel()
+    sigma_m = np.bincount(parts, np.where(parts > 0, sigma_z_m.ravel(), 0)) / np.maximum(np.bincount(parts), 1)
+    return [_grasp(i, cut, room, float(doubt[i]), tool, float(sigma_m[cut.part[i]])) for i in best.tolist()], reasons
 
 
 def _angle(cut: Slices) -> Float64[np.ndarray, "n"]:
@@ -74,55 +78,64 @@ def _wedge(cut: Slices) -> Float64[np.ndarray, "n"]:
 
 
 def _room(cut: Slices, fingers: Fingers, scene: Obstacles, margin_m: float) -> Room:
-    """The deepest and then widest place that is free of everything, unseen space included."""
+    """The deepest and then widest place that is free of everything, unseen space included.
+
+    Fingers are as wide at their tips as further up: where tips passed with the same gap, the rest of the finger passes too.
+    """
     room = Room(grip=np.zeros(len(cut.part)), gap_m=np.zeros(len(cut.part)))
-    for grip in GRIPS:
-        for gap in GAPS_M:
-            left = np.flatnonzero((room.grip == 0) & (cut.width_m + 2 * gap <= fingers.stroke_max_m))
-            free = left[~_hit(cut.take(left), fingers, grip, gap, scene, margin_m, 0.0)]
-            room.grip[free], room.gap_m[free] = grip, gap
-    for level in np.arange(LEVEL_M, fingers.length_m, LEVEL_M):
-        for grip in GRIPS:
-            for gap in GAPS_M:
-                left = np.flatnonzero((room.grip == grip) & (room.gap_m == gap))
-                if len(left):
-                    room.grip[left[_hit(cut.take(left), fingers, grip, gap, scene, margin_m, float(level))]] = 0
+    way = np.arange(GRIPS[0] * fingers.pad_depth_m - LEVEL_M, -fingers.length_m, -LEVEL_M)[::-1] / fingers.pad_depth_m
+    for gap_m in GAPS_M:
+        free = np.flatnonzero(cut.width_m + 2 * gap_m <= fingers.stroke_max_m)
+        tips = _tips(cut.take(free), fingers, gap_m, margin_m)
+        for grip in (*way.tolist(), *GRIPS):
+            clear = ~_inside(tips + (grip * fingers.pad_depth_m * cut.R_bin_tcp[free, :, 2].T)[..., None], scene)
+            free, tips = free[clear], tips[:, clear]
+            deeper = free[grip > room.grip[free]]
+            room.grip[deeper], room.gap_m[deeper] = grip, gap_m
     return room
 
 
-def _hit(cut: Slices, fingers: Fingers, grip: float, gap_m: float, scene: Obstacles, margin_m: float, level_m: float,
-         ) -> Bool[np.ndarray, "n"]:
-    """Whether a cross-section of the open fingers, `level_m` above their tips, is inside the scene."""
+def _tips(cut: Slices, fingers: Fingers, gap_m: float, margin_m: float) -> Float64[np.ndarray, "3 n k"]:
+    """Points all over both open fingers' tips, with the margin around them, where they are level with the deeper end."""
     across = fingers.pad_width_m / 2 + margin_m
-    beside = _spread(gap_m, gap_m + fingers.thickness_m + margin_m)
-    x, y = (grid.ravel() for grid in np.meshgrid(beside, _spread(-across, across)))
-    height = margin_m + grip * fingers.pad_depth_m - level_m
-    hit = np.zeros(len(cut.part), dtype=bool)
-    for side, end in ((-1, cut.low_m), (1, cut.high_m)):
-        local = np.stack([end[:, None] + side * x, cut.across_m[:, None] + y,
-                          np.broadcast_to((cut.deep_m + height)[:, None], (len(end), len(x)))], axis=-1)
-        hit |= _inside(np.matmul(local, cut.R_bin_tcp.transpose(0, 2, 1)), scene).any(axis=1)
-    return hit
+    outwards = _spread(gap_m, gap_m + fingers.thickness_m + margin_m)
+    x, y = (grid.ravel() for grid in np.meshgrid(outwards, _spread(-across, across)))
+    ends = np.concatenate([cut.low_m[:, None] - x, cut.high_m[:, None] + x], axis=1)
+    beside = cut.across_m[:, None] + np.tile(y, 2)
+    deep = (cut.deep_m + margin_m)[:, None]
+    R = cut.R_bin_tcp
+    tips: Float64[np.ndarray, "3 n k"] = np.stack(
+        [R[:, c, :1] * ends + R[:, c, 1:2] * beside + R[:, c, 2:] * deep for c in range(3)])
+    return tips
 
 
 def _spread(low: float, high: float) -> Float64[np.ndarray, "k"]:
     return np.linspace(low, high, 1 + int(np.ceil((high - low) / PITCH_M)))
 
 
-def _inside(points: Float64[np.ndarray, "n k 3"], scene: Obstacles) -> Bool[np.ndarray, "n k"]:
-    """Which points lie below the scene's surface; beyond the map it goes on as at its border."""
+def _inside(points: Float64[np.ndarray, "3 n k"], scene: Obstacles) -> Bool[np.ndarray, "n"]:
+    """Whether some point of each set lies below the scene's surface; beyond the map that goes on as at its border."""
     rows, cols = scene.height.shape
-    j = np.clip(((points[..., 0] - scene.origin_x_m) / scene.cell_m).astype(np.int32), 0, cols - 1)
-    i = np.clip(((points[..., 1] - scene.origin_y_m) / scene.cell_m).astype(np.int32), 0, rows - 1)
-    below: Bool[np.ndarray, "n k"] = scene.height[i, j] > points[..., 2]
+    j = ((points[0] - scene.origin_x_m) / scene.cell_m).astype(np.int32)
+    i = ((points[1] - scene.origin_y_m) / scene.cell_m).astype(np.int32)
+    index = np.clip(i, 0, rows - 1) * cols + np.clip(j, 0, cols - 1)
+    below: Bool[np.ndarray, "n"] = (scene.height.ravel()[index] > points[2]).any(axis=1)
     return below
+
+
+def _best(cut: Slices, doubt: Float64[np.ndarray, "n"], free: Int64[np.ndarray, "m"]) -> Int64[np.ndarray, "k"]:
+    """The least doubtful slices of each axis, in their own order."""
+    order = free[np.lexsort((doubt[free], cut.axis[free]))]
+    place = np.arange(len(order)) - np.searchsorted(cut.axis[order], cut.axis[order])
+    best: Int64[np.ndarray, "k"] = np.sort(order[place < PER_AXIS])
+    return best
 
 
 def _doubt(cut: Slices, room: Room) -> Float64[np.ndarray, "n"]:
     """What speaks against each slice, 0 to 1."""
     terms = {
         "angle": _angle(cut) / MAX_ANGLE_RAD, "wedge": _wedge(cut) / MAX_ANGLE_RAD, "uneven": cut.residual_m / MAX_RESIDUAL_M,
-        "shallow": 1 - room.grip / GRIPS[0], "tight": 1 - room.gap_m / GAPS_M[0]}
+        "shallow": 1 - room.grip / GRIPS[-1], "tight": 1 - room.gap_m / GAPS_M[0]}
     doubt: Float64[np.ndarray, "n"] = 1 - np.prod([1 - DOUBTS[name] * values for name, values in terms.items()], axis=0)
     return doubt
 

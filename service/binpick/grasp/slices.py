@@ -5,6 +5,7 @@ one sort orders them, and a slice is a window over neighbouring strips.
 """
 
 from dataclasses import dataclass, fields
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -44,12 +45,13 @@ class View:
 class Slices:
     """n slices, each in a frame turned by `R_bin_tcp` about the bin's origin: x closes, z approaches.
 
-    `low_m`, `high_m`: ends along x; `across_m`: its middle along y; `deep_m`: the deeper end along z. `slope`: angles of the
+    `axis` numbers the patches' closing axes. `low_m`, `high_m`: ends along x; `across_m`: its middle along y; `deep_m`: the deeper end along z. `slope`: angles of the
     lines through its strips' ends to y; `residual_m`: how far an end leaves its line; `lean`: of the mean normal to z in the
     closing plane; `chord`: of the line from end to end to x. Angles in radians.
     """
 
     part: Int64[np.ndarray, "n"]
+    axis: Int64[np.ndarray, "n"]
     R_bin_tcp: Float64[np.ndarray, "n 3 3"]
     low_m: Values
     high_m: Values
@@ -73,11 +75,11 @@ class Slices:
 
 def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     """All slices of all parts and faces, good or not, `width_m` wide; none is looked at more than `max_tilt_rad` aslant."""
-    views = [view for part, points, normals in _patches(segments) for view in _views(part, points, normals, max_tilt_rad)]
+    views = _views(_patches(segments), max_tilt_rad)
     turned = [(view, angle) for view in views for angle in _axes(view)]
     if not turned:
         none = np.zeros(0)
-        return Slices(none.astype(np.int64), np.zeros((0, 3, 3)), none, none, none, none, np.zeros((0, 2)), none, none, none)
+        return Slices(none.astype(np.int64), none.astype(np.int64), np.zeros((0, 3, 3)), none, none, none, none, np.zeros((0, 2)), none, none, none)
     pitch = width_m / STRIPS
     strips = _strips(turned, pitch)
     known = np.isfinite(strips.low)
@@ -90,7 +92,7 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     left, right = np.nanmin(low, axis=1), np.nanmax(high, axis=1)
     frames = np.stack([_frame(view, angle) for view, angle in turned])
     return Slices(
-        part=np.array([view.part for view, _ in turned])[which], R_bin_tcp=frames[which], low_m=left, high_m=right,
+        part=np.array([view.part for view, _ in turned])[which], axis=which, R_bin_tcp=frames[which], low_m=left, high_m=right,
         across_m=(strips.first[which] + STEP * window - (STRIPS - LEAST_STRIPS) + STRIPS / 2) * pitch,
         deep_m=ends_z.max(axis=0),
         slope=np.arctan(np.stack([low_slope, high_slope], axis=1)), residual_m=np.maximum(low_off, high_off),
@@ -98,19 +100,24 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
         chord=np.arctan2(ends_z[1] - ends_z[0], np.maximum(right - left, 1e-6)))
 
 
-def _patches(segments: Segments) -> list[tuple[int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]:
+Patch: TypeAlias = tuple[int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+
+
+def _patches(segments: Segments) -> list[Patch]:
     """Part label, points and normals of every part, and of every face that is not nearly a whole part."""
     parts, xyz, normal = segments.parts.ravel(), segments.xyz.reshape(-1, 3), segments.normal.reshape(-1, 3)
     found = []
     for labels in (segments.parts, segments.faces):
+        sizes = np.bincount(labels.ravel())
         kept = np.flatnonzero((labels.ravel() > 0) & (parts > 0) & _telling(labels).ravel())
-        order = kept[np.argsort(labels.ravel()[kept], kind="stable")]
+        # 16 bits are sorted in one pass
+        order = kept[np.argsort(labels.ravel()[kept].astype(np.uint16), kind="stable")]
         cuts = np.flatnonzero(np.diff(labels.ravel()[order])) + 1
         for pixels in np.split(order, cuts):
             if not len(pixels):
                 continue
             part, label = int(parts[pixels[0]]), int(labels.ravel()[pixels[0]])
-            if labels is segments.faces and (labels == label).sum() > WHOLE * len(segments.part_points[part]):
+            if labels is segments.faces and sizes[label] > WHOLE * len(segments.part_points[part]):
                 continue
             found.append((part, xyz[pixels].astype(np.float64), normal[pixels].astype(np.float64)))
     return found
@@ -128,16 +135,26 @@ def _telling(labels: Labels) -> np.ndarray:
     return telling
 
 
-def _views(part: int, points: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"], max_tilt_rad: float,
-           ) -> list[View]:
-    """The patch along its mean normal, as far as the tool may tilt, and straight down."""
-    mean = normals.mean(axis=0) / max(float(np.linalg.norm(normals.mean(axis=0))), 1e-9)
-    tilt = float(np.arccos(np.clip(mean[2], -1, 1)))
-    approaches = [-mean] if tilt <= max_tilt_rad else []
-    if tilt > SAME_RAD:
-        approaches.append(np.array([0.0, 0.0, -1.0]))
-    turns = [geometry.frame_of_axes(approach, np.array([1.0, 0.0, 0.0]), np.zeros(3))[:3, :3] for approach in approaches]
-    return [View(part, R, points @ R, normals @ R) for R in turns]
+def _views(patches: list[Patch], max_tilt_rad: float) -> list[View]:
+    """Every patch along its mean normal, as far as the tool may tilt, and straight down."""
+    seen = []
+    for patch in patches:
+        mean = patch[2].mean(axis=0)
+        mean /= max(float(np.sqrt(mean @ mean)), 1e-9)
+        tilt = float(np.arccos(np.clip(mean[2], -1, 1)))
+        if tilt <= max_tilt_rad:
+            seen.append((patch, -mean))
+        if tilt > SAME_RAD:
+            seen.append((patch, np.array([0.0, 0.0, -1.0])))
+    return [View(part, R, points @ R, normals @ R)
+            for ((part, points, normals), _), R in zip(seen, _frames(np.array([z for _, z in seen]).reshape(-1, 3)), strict=True)]
+
+
+def _frames(z: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Rotations whose z is given and whose x lies in the plane of it and the bin's x; a tool's approach is never along x."""
+    x = np.array([1.0, 0.0, 0.0]) - z[:, :1] * z
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
 def _axes(view: View) -> list[float]:
@@ -146,8 +163,8 @@ def _axes(view: View) -> list[float]:
     if len(flat) < LEAST_STRIPS:
         return []
     rectangle = float(np.radians(cv2.minAreaRect(flat.astype(np.float32))[2]))
-    (a, b), (_, c) = np.cov(flat.T)
-    principal = float(np.arctan2(2 * b, a - c) / 2)
+    u, v = (flat - flat.mean(axis=0)).T
+    principal = float(np.arctan2(2 * (u @ v), u @ u - v @ v) / 2)
     found: list[float] = []
     for angle in (rectangle, rectangle + np.pi / 2, principal, principal + np.pi / 2):
         if all(abs((angle - other + np.pi / 2) % np.pi - np.pi / 2) > SAME_RAD for other in found):
