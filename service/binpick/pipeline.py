@@ -191,14 +191,15 @@ def _code(filled: load_carrier.Filling, counts: dict[str, int], messages: tuple[
         return Code.OVERFILLED if filled.overfilled else Code.OK
     if counts["clear"]:
         return Code.ALL_OUT_OF_REACH
-    if counts["collide"] or counts.get("no_room"):
+    if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
     if filled.proved_empty:
         return Code.BIN_EMPTY
     return Code.NOTHING_GRASPABLE if filled.occupied else Code.BIN_UNKNOWN
 
 
-REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "no_room", "collide")
+REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
+           "collide")
 
 
 def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from binpick import geometry
-from binpick.data import Grasp, HeightMap
+from binpick.data import Grasp, HeightMap, Segments
 from binpick.geometry import Transform, Vector
 from binpick.settings import Bin, Body, Box, SuctionTool, Tool
 from binpick.settings.base import Placement
@@ -26,6 +26,12 @@ SWEEP_STEP_M = 0.015
 """Distance of the tool's checked positions along the approach: less than any body is long in that direction."""
 HORIZON_M = 0.020
 """Clearances above this are reported as this."""
+BESIDE_M = 0.0045
+"""How far beyond a part's outline the next one is looked at: further than depth is missing at a step."""
+WALL_M = 0.006
+"""Points this near a wall may be the wall."""
+ABOVE_M = 0.004
+"""What stands this much higher there may lie on the part: four sigma of depth at 1 m."""
 CONTACT_M = 0.003
 """Points this little above the TCP's plane belong to the surface that is gripped."""
 
@@ -39,6 +45,15 @@ class Obstacles:
     cell_m: float
     origin_x_m: float
     origin_y_m: float
+
+    def within(self, points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points lie inside the bin's walls, and not on them; NaN does not."""
+        border = round(PAD_M / self.cell_m) * self.cell_m + WALL_M
+        rows, cols = self.height.shape
+        x, y = points[:, 0] - self.origin_x_m, points[:, 1] - self.origin_y_m
+        inside: Bool[np.ndarray, "n"] = (np.minimum(x, cols * self.cell_m - x) > border) & (
+            np.minimum(y, rows * self.cell_m - y) > border)
+        return inside
 
 
 def obstacles(heights: HeightMap, model: Bin) -> Obstacles:
@@ -160,6 +175,26 @@ def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float)
         outside = [np.maximum(away[near], 0) for away in beyond]
         nearest.append(float(np.sqrt(sum(away * away for away in outside).min(initial=np.inf))))
     return float(np.min(nearest))
+
+
+def covered(segments: Segments, scene: Obstacles) -> dict[int, float]:
+    """The share of each part's outline, as seen, beside which something stands higher: there it may go on underneath.
+
+    A part under another takes it along, or loses its hold, on the way up; no height map shows that. Walls do not count.
+    """
+    parts, xyz, cols = segments.parts.ravel(), segments.xyz.reshape(-1, 3), segments.parts.shape[1]
+    pixels = np.flatnonzero(parts)
+    spacing_m = np.linalg.norm(np.take(xyz, pixels[::8] + 1, axis=0, mode="clip") - xyz[pixels[::8]], axis=1)
+    beyond = max(2, round(BESIDE_M / max(float(np.nanmedian(spacing_m)), 1e-4))) if len(pixels) else 2
+    border = np.zeros(int(parts.max(initial=0)) + 1, dtype=np.int64)
+    under = np.zeros_like(border)
+    for step in (1, -1, cols, -cols):
+        edge = pixels[np.take(parts, pixels + step, mode="clip") != parts[pixels]]
+        there = np.clip(edge + beyond * step, 0, len(parts) - 1)
+        higher = (parts[there] != parts[edge]) & (xyz[there, 2] - xyz[edge, 2] > ABOVE_M) & scene.within(xyz[there])
+        border += np.bincount(parts[edge], minlength=len(border))
+        under += np.bincount(parts[edge[higher]], minlength=len(border))
+    return {label: float(under[label] / max(border[label], 1)) for label in segments.part_points}
 
 
 def blocked(grasps: list[Grasp], tool: Tool, heights: HeightMap) -> Bool[np.ndarray, "n"]:

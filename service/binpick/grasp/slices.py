@@ -9,9 +9,8 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
-from binpick import geometry
 from binpick.data import Labels, Segments
 
 STRIPS = 5
@@ -24,6 +23,8 @@ WHOLE = 0.85
 """A face with more than this share of its part is the part."""
 SAME_RAD = np.radians(6.0)
 """Axes and approaches this near each other are one."""
+TOUCH_M = 0.0005
+"""Strips that end this near the outermost end are touched with it."""
 THIN = 2
 """Inside a patch every second point of every second row is enough; its border counts in full."""
 
@@ -45,9 +46,10 @@ class View:
 class Slices:
     """n slices, each in a frame turned by `R_bin_tcp` about the bin's origin: x closes, z approaches.
 
-    `axis` numbers the patches' closing axes. `low_m`, `high_m`: ends along x; `across_m`: its middle along y; `deep_m`: the deeper end along z. `slope`: angles of the
-    lines through its strips' ends to y; `residual_m`: how far an end leaves its line; `lean`: of the mean normal to z in the
-    closing plane; `chord`: of the line from end to end to x. Angles in radians.
+    `axis` numbers the patches' closing axes. `low_m`, `high_m`: ends along x; `across_m`: middle along y; `deep_m`: the deeper
+    end along z, `touch_m`: the higher of the places where a closing pad meets the ends first. `slope`: angles of the lines
+    through its strips' ends to y; `residual_m`: how far an end leaves its line; `lean`: of the mean normal to z in the closing
+    plane; `chord`: of the line from end to end to x. Angles in radians.
     """
 
     part: Int64[np.ndarray, "n"]
@@ -57,6 +59,7 @@ class Slices:
     high_m: Values
     across_m: Values
     deep_m: Values
+    touch_m: Values
     slope: Float64[np.ndarray, "n 2"]
     residual_m: Values
     lean: Values
@@ -78,8 +81,8 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     views = _views(_patches(segments), max_tilt_rad)
     turned = [(view, angle) for view in views for angle in _axes(view)]
     if not turned:
-        none = np.zeros(0)
-        return Slices(none.astype(np.int64), none.astype(np.int64), np.zeros((0, 3, 3)), none, none, none, none, np.zeros((0, 2)), none, none, none)
+        whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return Slices(whole, whole, np.zeros((0, 3, 3)), real, real, real, real, real, np.zeros((0, 2)), real, real, real)
     pitch = width_m / STRIPS
     strips = _strips(turned, pitch)
     known = np.isfinite(strips.low)
@@ -90,11 +93,13 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     (low_slope, low_off), (high_slope, high_off) = (_lines(at, ends) for ends in (low, high))
     ends_z = np.stack([_mean(low_z), _mean(high_z)])
     left, right = np.nanmin(low, axis=1), np.nanmax(high, axis=1)
+    touch = [np.where(outwards <= TOUCH_M, z, np.inf).min(axis=1)
+             for outwards, z in ((low - left[:, None], low_z), (right[:, None] - high, high_z))]
     frames = np.stack([_frame(view, angle) for view, angle in turned])
     return Slices(
         part=np.array([view.part for view, _ in turned])[which], axis=which, R_bin_tcp=frames[which], low_m=left, high_m=right,
         across_m=(strips.first[which] + STEP * window - (STRIPS - LEAST_STRIPS) + STRIPS / 2) * pitch,
-        deep_m=ends_z.max(axis=0),
+        deep_m=ends_z.max(axis=0), touch_m=np.minimum(*touch),
         slope=np.arctan(np.stack([low_slope, high_slope], axis=1)), residual_m=np.maximum(low_off, high_off),
         lean=np.arctan2(np.nansum(nx, axis=1), -np.nansum(nz, axis=1)),
         chord=np.arctan2(ends_z[1] - ends_z[0], np.maximum(right - left, 1e-6)))
@@ -106,33 +111,32 @@ Patch: TypeAlias = tuple[int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n
 def _patches(segments: Segments) -> list[Patch]:
     """Part label, points and normals of every part, and of every face that is not nearly a whole part."""
     parts, xyz, normal = segments.parts.ravel(), segments.xyz.reshape(-1, 3), segments.normal.reshape(-1, 3)
+    on_part = np.flatnonzero(parts)
     found = []
     for labels in (segments.parts, segments.faces):
-        sizes = np.bincount(labels.ravel())
-        kept = np.flatnonzero((labels.ravel() > 0) & (parts > 0) & _telling(labels).ravel())
+        flat = labels.ravel()
+        sizes = np.bincount(flat[on_part])
+        kept = on_part[_telling(labels, on_part)]
         # 16 bits are sorted in one pass
-        order = kept[np.argsort(labels.ravel()[kept].astype(np.uint16), kind="stable")]
-        cuts = np.flatnonzero(np.diff(labels.ravel()[order])) + 1
-        for pixels in np.split(order, cuts):
+        order = kept[np.argsort(flat[kept].astype(np.uint16), kind="stable")]
+        for pixels in np.split(order, np.flatnonzero(np.diff(flat[order])) + 1):
             if not len(pixels):
                 continue
-            part, label = int(parts[pixels[0]]), int(labels.ravel()[pixels[0]])
+            part, label = int(parts[pixels[0]]), int(flat[pixels[0]])
             if labels is segments.faces and sizes[label] > WHOLE * len(segments.part_points[part]):
                 continue
             found.append((part, xyz[pixels].astype(np.float64), normal[pixels].astype(np.float64)))
     return found
 
 
-def _telling(labels: Labels) -> np.ndarray:
-    """The border of every patch, and a thin grid inside."""
-    telling = np.zeros(labels.shape, dtype=bool)
-    telling[::THIN, ::THIN] = True
-    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
-    telling[:, 1:] |= across
-    telling[:, :-1] |= across
-    telling[1:] |= down
-    telling[:-1] |= down
-    return telling
+def _telling(labels: Labels, pixels: Int64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Which of the pixels are labelled and at the border of their patch, or on a thin grid inside."""
+    flat, cols = labels.ravel(), labels.shape[1]
+    telling = (pixels // cols % THIN == 0) & (pixels % cols % THIN == 0)
+    for step in (-cols, -1, 1, cols):
+        telling |= flat[pixels] != np.take(flat, pixels + step, mode="clip")
+    found: Bool[np.ndarray, "n"] = telling & (flat[pixels] > 0)
+    return found
 
 
 def _views(patches: list[Patch], max_tilt_rad: float) -> list[View]:
@@ -146,8 +150,8 @@ def _views(patches: list[Patch], max_tilt_rad: float) -> list[View]:
             seen.append((patch, -mean))
         if tilt > SAME_RAD:
             seen.append((patch, np.array([0.0, 0.0, -1.0])))
-    return [View(part, R, points @ R, normals @ R)
-            for ((part, points, normals), _), R in zip(seen, _frames(np.array([z for _, z in seen]).reshape(-1, 3)), strict=True)]
+    frames = _frames(np.array([approach for _, approach in seen]).reshape(-1, 3))
+    return [View(part, R, points @ R, normals @ R) for ((part, points, normals), _), R in zip(seen, frames, strict=True)]
 
 
 def _frames(z: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
