@@ -105,7 +105,7 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
         chord=np.arctan2(ends_z[1] - ends_z[0], np.maximum(right - left, 1e-6)))
 
 
-Patch: TypeAlias = tuple[int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+Patch: TypeAlias = tuple[int, Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]
 
 
 def _patches(segments: Segments) -> list[Patch]:
