@@ -73,7 +73,8 @@ def table(run: dict[str, Any]) -> Group:
         "bad-2",
         "median |Δd|",
         "density",
-        title=f"Exam world {run['world']}, {run['kinds']}, {run['tool']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, tables {run['exam_sha256'][:12]}",
+        title=f"Exam world {run['world']}, {run['kinds']}, {run['tool']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, "
+        f"tables {run['exam_sha256'][:12]}",
     )
     depth.add_row(
         "difficulty", f"{plain['bad1']:.1%}", f"{plain['bad2']:.1%}", f"{plain['median_px']:.3f} px", f"{plain['density']:.1%}"
