@@ -11,6 +11,7 @@ from binpick.data import Image, OrganisedCloud, Rectified
 from binpick.geometry import Points, Transform
 from binpick.message import PoseMessage, Triple
 from binpick.result import CycleInput, CycleResult, GraspMessage, ReturnCode
+from binpick.settings import SuctionTool, Tool
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Colour = tuple[int, int, int]
@@ -95,7 +96,7 @@ def _overlay(inputs: CycleInput, cycle: CycleResult) -> bytes:
     if (T_base_camera := inputs.T_base_camera) is not None:
         T_camera_frame["base"] = geometry.inverse(T_base_camera)
     for grasp in reversed(result.grasps):  # the best one on top
-        _draw_grasp(picture, cycle.rectified, T_camera_frame[grasp.frame], grasp, inputs.job.tool.cups[0].radius_m)
+        _draw_grasp(picture, cycle.rectified, T_camera_frame[grasp.frame], grasp, inputs.job.tool_numbered(grasp.tool.number))
     return _png(_captioned(picture, _sentence(result.return_code), _banner(result.return_code)))
 
 
@@ -132,23 +133,31 @@ def _draw_bin(picture: Picture, rectified: Rectified, T_camera_bin: Transform, i
                 _line(picture, pixels[[first, first | axis]], colour, 2 if rim else 1)
 
 
-def _draw_grasp(picture: Picture, rectified: Rectified, T_camera_frame: Transform, grasp: GraspMessage,
-                radius_m: float) -> None:
-    """The cup's lip in its true size, the line it comes along, and its rank beside the lip."""
+def _draw_grasp(picture: Picture, rectified: Rectified, T_camera_frame: Transform, grasp: GraspMessage, tool: Tool) -> None:
+    """What touches the part in its true size (lip, or open fingertips), the line it comes along, and its rank beside."""
     T_camera_tcp = T_camera_frame @ geometry.from_quaternion(np.array(grasp.position_m), np.array(grasp.quaternion_xyzw))
-    lip = radius_m * np.stack([np.cos(RING), np.sin(RING), np.zeros_like(RING)], -1)
-    ring = _project(rectified, geometry.transform(T_camera_tcp, lip))
+    outlines = [_project(rectified, geometry.transform(T_camera_tcp, outline)) for outline in _outlines(tool, grasp.open_m)]
     way = _project(rectified, geometry.transform(T_camera_tcp, np.array([[0, 0, -grasp.approach_m], [0, 0, 0.0]])))
     colour = BEST if grasp.rank == 1 else OTHERS
     scale = max(1.0, picture.shape[1] / 900)
     along = way[0] - way[1]
     length = float(np.linalg.norm(along))
     away = along / length if length > 1 else np.array([0.0, -1.0])
-    beside = way[1] + away * max(length, float(np.ptp(ring, axis=0).max()) / 2 + 18 * scale)
+    beside = way[1] + away * max(length, float(np.ptp(np.concatenate(outlines), axis=0).max()) / 2 + 18 * scale)
     for ink, extra in ((SHADOW, 3), (colour, 0)):  # dark below bright: readable on any ground
         _line(picture, np.stack([beside, way[1]]), ink, round(scale) + extra)
-        _line(picture, ring, ink, round(2 * scale) + extra)
+        for outline in outlines:
+            _line(picture, outline, ink, round(2 * scale) + extra)
     _badge(picture, beside, str(grasp.rank), colour, scale)
+
+
+def _outlines(tool: Tool, open_m: float) -> list[np.ndarray]:
+    """Closed lines in the plane of the TCP: the lip, or both open fingertips."""
+    if isinstance(tool, SuctionTool):
+        return [tool.cups[0].radius_m * np.stack([np.cos(RING), np.sin(RING), np.zeros_like(RING)], -1)]
+    inner, outer, half = open_m / 2, open_m / 2 + tool.fingers.thickness_m, tool.fingers.pad_width_m / 2
+    corners = np.array([[inner, -half, 0.0], [outer, -half, 0.0], [outer, half, 0.0], [inner, half, 0.0], [inner, -half, 0.0]])
+    return [corners * [side, 1, 1] for side in (-1, 1)]
 
 
 def _badge(picture: Picture, centre: Float[np.ndarray, "2"], text: str, colour: Colour, scale: float) -> None:

@@ -186,6 +186,7 @@ class Grasp:
     """A candidate while it is being judged; T_bin_tcp as in a published pose, z into the object.
 
     `seal_m` is how far the lip must bend to follow the surface; `room` the share of the lip around which the part goes on.
+    `doubt` is what speaks against two fingers' hold, 0 to 1. `open_m` and `close_m` are 0 for suction.
     """
 
     T_bin_tcp: Transform
@@ -200,3 +201,4 @@ class Grasp:
     sigma_z_m: float
     sigma_tilt_rad: float
     clearance_m: float = float("nan")
+    doubt: float = 0.0

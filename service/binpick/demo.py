@@ -224,8 +224,9 @@ def _move(twin: Twin, result: PlcResult, recipe: int, tool: settings.Tool) -> Pi
         return Pick(code, recipe, result.acquire_ms, result.total_ms)
     if result.frame != BASE_FRAME:
         raise NotReady(f"the registers give poses in frame {result.frame}, the robot needs its base ({BASE_FRAME})")
-    T_base_tcp = result.records[0].T_frame_tcp
-    return Pick(code, recipe, result.acquire_ms, result.total_ms, T_base_tcp, twin.move(T_base_tcp, tool))
+    first = result.records[0]
+    verdict = twin.move(first.T_frame_tcp, tool, first.open_m, first.close_m)
+    return Pick(code, recipe, result.acquire_ms, result.total_ms, first.T_frame_tcp, verdict)
 
 
 def _sum_up(plan: Plan, picks: list[Pick], left: int, say: Console) -> int:

@@ -6,12 +6,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float32
 
 from binpick import geometry
 from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.geometry import Transform
-from binpick.grasp import clearance, gate, rank, suction
+from binpick.grasp import clearance, fingers, gate, rank, suction
 from binpick.message import BinMessage, FillCellMessage, PoseMessage, RimMessage
 from binpick.result import (
     CycleInput,
@@ -34,12 +35,14 @@ from binpick.scene import heightmap
 from binpick.scene import segment as segmentation
 from binpick.scene.location import Location, locate
 from binpick.scene.surface import surface
-from binpick.settings import Job
+from binpick.settings import Job, SuctionTool
 from binpick.stereo import cloud, rectify
 from binpick.stereo import depth as stereo
 
 LEAST_MEASURED = 0.20
 """Below this share of measured pixels in the window there is no depth to speak of."""
+MOST_LOOKED_AT = 80
+"""So many of the best grasps get an exact look at what their tool would hit."""
 
 Proceed = Callable[[], None]
 
@@ -94,9 +97,10 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
     with clock.stage("segment"):
         segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
     with clock.stage("grasp"):
-        found, counts = suction.candidates(segments, job.tool, grid.sigma_z_m)
+        scene = clearance.obstacles(heights, job.bin)
+        found, counts = _candidates(segments, grid.sigma_z_m, scene, job)
     with clock.stage("clearance"):
-        kept, clear_counts = _clear(found, segments, heights, inputs)
+        kept, clear_counts = _clear(found, segments, heights, scene, inputs)
     counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **clear_counts}
     messages, gate_counts = _publishable(kept, inputs, frames)
     counts |= gate_counts
@@ -105,23 +109,41 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
     return replace(seen, result=result, segments=segments)
 
 
-def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, inputs: CycleInput,
+def _candidates(segments: Segments, sigma_z_m: Float32[np.ndarray, "h w"], scene: clearance.Obstacles, job: Job,
+                ) -> tuple[list[Grasp], dict[str, int]]:
+    """What any of the recipe's tools could grip, and how many tries fell out for which reason."""
+    grasps: list[Grasp] = []
+    counts: dict[str, int] = {}
+    for tool in job.tools:
+        if isinstance(tool, SuctionTool):
+            found, reasons = suction.candidates(segments, tool, sigma_z_m)
+        else:
+            found, reasons = fingers.candidates(segments, tool, sigma_z_m, scene, job.recipe.limits.margin_m)
+        grasps += found
+        counts |= {reason: count + counts.get(reason, 0) for reason, count in reasons.items()}
+    return grasps, counts
+
+
+def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: clearance.Obstacles, inputs: CycleInput,
            ) -> tuple[list[Grasp], dict[str, int]]:
     """The best grasps whose tool touches nothing, in order, with their clearance."""
     job, wanted = inputs.job, inputs.request.max_grasps or inputs.job.recipe.max_grasps
-    sieve = clearance.blocked(found, job.tool, heights)
-    ordered = rank.rank([g for g, hit in zip(found, sieve, strict=True) if not hit], segments, job.tool)
-    scene = clearance.obstacles(heights, job.bin)
+    free: list[Grasp] = []
+    for tool in job.tools:
+        mine = [grasp for grasp in found if grasp.tool == tool.number]
+        free += [grasp for grasp, hit in zip(mine, clearance.blocked(mine, tool, heights), strict=True) if not hit]
+    collide, looked = len(found) - len(free), 0
     kept: list[Grasp] = []
-    collide = int(sieve.sum())
-    for grasp in ordered:
-        distance_m = clearance.clearance(grasp, job.tool, scene)
-        if distance_m < job.recipe.limits.margin_m:
-            collide += 1
-            continue
-        kept.append(replace(grasp, clearance_m=distance_m))
-        if len(kept) == wanted:
+    for grasp in rank.ordered(free, segments, *job.tools):
+        if len(kept) == wanted or looked == MOST_LOOKED_AT:
             break
+        if rank.adds(grasp, kept):
+            looked += 1
+            distance_m = clearance.clearance(grasp, job.tool_numbered(grasp.tool), scene)
+            if distance_m < job.recipe.limits.margin_m:
+                collide += 1
+            else:
+                kept.append(replace(grasp, clearance_m=distance_m))
     return kept, {"collide": collide, "clear": len(kept)}
 
 
@@ -141,7 +163,8 @@ def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tu
         objection = gate.malformed(grasp) if fresh else "older_than_trigger"
         if not objection:
             message = _message(grasp, inputs, T_frame_bin, len(messages) + 1)
-            objection = gate.objection(message, T_bin_frame, T_reach_frame, job.bin, job.tool, job.recipe.limits)
+            objection = gate.objection(message, T_bin_frame, T_reach_frame, job.bin,
+                                       job.tool_numbered(grasp.tool), job.recipe.limits)
         if objection:
             stopped[f"gate_{objection}"] = stopped.get(f"gate_{objection}", 0) + 1
         else:
@@ -150,7 +173,7 @@ def _publishable(kept: list[Grasp], inputs: CycleInput, frames: "_Frames") -> tu
 
 
 def _message(grasp: Grasp, inputs: CycleInput, T_frame_bin: Transform, number: int) -> GraspMessage:
-    tool = inputs.job.tool
+    tool = inputs.job.tool_numbered(grasp.tool)
     T_frame_tcp = T_frame_bin @ grasp.T_bin_tcp
     return GraspMessage(
         id=f"{inputs.cycle_id}-{number}", rank=number, tool=ToolMessage(number=tool.number, name=tool.name, kind=tool.kind),
@@ -172,14 +195,15 @@ def _code(filled: load_carrier.Filling, counts: dict[str, int], messages: tuple[
         return Code.OVERFILLED if filled.overfilled else Code.OK
     if counts["clear"]:
         return Code.ALL_OUT_OF_REACH
-    if counts["collide"]:
+    if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
     if filled.proved_empty:
         return Code.BIN_EMPTY
     return Code.NOTHING_GRASPABLE if filled.occupied else Code.BIN_UNKNOWN
 
 
-REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "collide")
+REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
+           "collide")
 
 
 def _answer(inputs: CycleInput, frames: "_Frames", clock: "_Clock", code: Code, filled: load_carrier.Filling | None = None,

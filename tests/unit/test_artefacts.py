@@ -24,7 +24,7 @@ from binpick.result import (
     ToolMessage,
 )
 from binpick.rig import Rig
-from binpick.settings import Bin, Job, Pose, Recipe, Tool
+from binpick.settings import Bin, Job, Pose, Recipe, SuctionTool, TwoFingerTool
 
 WIDTH, HEIGHT, MARGIN, FOCAL = 400, 300, 32, 500.0
 STRIP = round(WIDTH * 0.055)
@@ -48,7 +48,7 @@ def inputs(request: Request | None = None, **hand_eye: object) -> CycleInput:
     rig = Rig.model_validate({"image_size_px": (440, 320), "cameras": [
         {"name": name, "K": ((FOCAL, 0, 220), (0, FOCAL, 160), (0, 0, 1)), "distortion": (0, 0, 0, 0),
          "T_cam_rig": rows(geometry.translation(x, 0.0, 0.0))} for name, x in (("left", 0.0), ("right", -0.15))], **hand_eye})
-    job = Job(recipe=Recipe(), bin=Bin(inner_size_m=(0.4, 0.3, 0.1), pose=Pose(position_m=(0, 0, 1))), tool=Tool())
+    job = Job(recipe=Recipe(), bin=Bin(inner_size_m=(0.4, 0.3, 0.1), pose=Pose(position_m=(0, 0, 1))), tools=(SuctionTool(),))
     pair = StereoPair(frames[0], frames[1], "2026-01-02T03:04:05.678Z", 0.0, 0.0, "none")
     return CycleInput(3, pair, rig, job, request or Request())
 
@@ -125,6 +125,17 @@ def test_a_grasp_is_drawn_where_the_pinhole_model_puts_it() -> None:
     best = np.abs(shown.astype(int) - artefacts.BEST).max(axis=2) < 40
     lip = [best[round(v + radius_px * np.sin(a)), round(u + radius_px * np.cos(a))] for a in np.linspace(0, 6.28, 24)]
     assert np.mean(lip) > 0.8
+
+
+def test_open_fingers_are_drawn_on_either_side() -> None:
+    tool = TwoFingerTool(kind="two_finger")
+    given = inputs()
+    given = replace(given, job=given.job.model_copy(update={"tools": (tool,)}))
+    pinch = grasp(geometry.make(T_CAMERA_RECT[:3, :3], geometry.transform(T_CAMERA_RECT, np.array([0.0, 0.0, 0.9]))), "camera")
+    shown = picture(artefacts.render(given, cycle(Code.OK, pinch.model_copy(update={"open_m": 0.05})), "overlay.png")[1])
+    best = np.abs(shown.astype(int) - artefacts.BEST).max(axis=2) < 40
+    middle, inner_px = 160 - 10 + STRIP, FOCAL * 0.025 / 0.9
+    assert all(best[middle - 1:middle + 2, round(220 - 20 + side * inner_px)].any() for side in (-1, 1))
 
 
 @pytest.mark.parametrize("mounting", ["fixed", "flange"])

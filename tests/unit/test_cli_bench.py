@@ -23,7 +23,7 @@ def test_the_whole_exam_keeps_its_options_and_names_its_parts(monkeypatch, capsy
     assert "stereo" in says
     assert call(monkeypatch, "exam", "--help") == 0
     says = capsys.readouterr().out
-    for word in ("--world", "--scenes", "--cycles", "--textbook", "--tuning", "--modbus", "--json"):
+    for word in ("--world", "--scenes", "--cycles", "--textbook", "--tuning", "--tool", "--kinds", "--modbus", "--json"):
         assert word in says
     assert call(monkeypatch, "--modbus", "here") == call(monkeypatch, "exam", "--modbus", "here") == 2
     assert capsys.readouterr().err.count("HOST:PORT") == 2
@@ -40,6 +40,7 @@ def test_the_stereo_part_has_its_own(monkeypatch, capsys):
 @pytest.mark.parametrize(("arguments", "says"), [
     (("--tuning", "stereo"), "unexpected extra argument"),
     (("stereo", "--world", "C"), "A, B and all"),
+    (("--tool", "hook"), "there are suction and two_finger"),
     (("stereo", "--middlebury", "nowhere"), "no Middlebury scenes"),
 ])
 def test_what_cannot_be_is_one_line(monkeypatch, capsys, arguments, says):

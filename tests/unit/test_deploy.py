@@ -20,7 +20,7 @@ def test_the_example_cell_file_is_real_cameras_over_the_demos_bin() -> None:
     assert cell.bins[0].inner_size_m == exam.setup("A").bin_size_m
     assert cell.rig == ROOT / "deploy/rig.json"
     assert settings.resolve(cell).recipe.frame == "camera"    # works before there is a hand-eye calibration
-    assert cell.tools[0].bodies == settings.Tool().bodies
+    assert cell.tools[0].bodies == settings.SuctionTool().bodies
 
 
 def test_the_schema_is_current() -> None:

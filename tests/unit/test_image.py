@@ -27,7 +27,7 @@ from binpick.result import (
     SyncMessage,
     ToolMessage,
 )
-from binpick.settings import Bin, Job, Pose, Recipe, Tool
+from binpick.settings import Bin, Job, Pose, Recipe, SuctionTool, TwoFingerTool
 
 QUATERNION = (0.5, -0.5, 0.5, 0.5)
 VALID = Status.VALID | Status.ACK | Status.ACQ_DONE
@@ -266,8 +266,14 @@ def test_an_unsound_flange_pose_is_refused(numbers: str) -> None:
 
 
 def test_the_echo_names_what_was_really_used() -> None:
-    job = Job(recipe=Recipe(number=4, frame="camera", pose_format="fanuc_wpr_deg"), tool=Tool(number=9),
+    job = Job(recipe=Recipe(number=4, frame="camera", pose_format="fanuc_wpr_deg"), tools=(SuctionTool(number=9),),
               bin=Bin(number=5, inner_size_m=(0.6, 0.4, 0.2), pose=Pose()))
     assert Echo.of(Request(), job) == Echo(recipe=4, bin=5, frame=1, pose_format=4, tool=9)
     asked = Request(frame="base", pose_format="rotvec_rad")
     assert Echo.of(asked, job) == Echo(recipe=4, bin=5, frame=3, pose_format=2, tool=9)
+
+
+def test_the_echo_leaves_the_tool_open_where_a_recipe_has_several() -> None:
+    job = Job(recipe=Recipe(number=4), tools=(SuctionTool(number=9), TwoFingerTool(number=2, kind="two_finger")),
+              bin=Bin(number=5, inner_size_m=(0.6, 0.4, 0.2), pose=Pose()))
+    assert Echo.of(Request(), job).tool == 0

@@ -11,7 +11,9 @@ from binpick.data import Grasp, Light, StereoPair
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
 from binpick.lab import exam
 from binpick.result import CycleInput, PoseMessage, Request
+from binpick.settings import SuctionTool, TwoFingerTool
 from binpick.settings.recipe import Shot
+from binpick.sim import score
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +202,22 @@ def test_a_later_shot_older_than_its_trigger_stops_the_poses(several):
     first, last = several.more
     stale = replace(last, left=replace(last.left, received_ns=last.left.triggered_ns))
     assert set(pipeline.run(replace(several, more=(first, stale))).result.stopped) == {"older_than_trigger"}
+
+
+def test_every_grasp_of_two_tools_says_which_it_is_for_and_only_fingers_open(paper):
+    tools = (SuctionTool(number=3), TwoFingerTool(number=8, kind="two_finger", approach_m=0.06))
+    for chosen in (tools, tools[1:]):
+        job = paper.inputs.job.model_copy(update={"tools": chosen})
+        result = pipeline.run(replace(paper.inputs, job=job, request=Request(frame="bin", max_grasps=20))).result
+        kinds = {tool.number: tool.kind for tool in chosen}
+        assert {g.tool.number for g in result.grasps} == set(kinds)
+        for grasp in result.grasps:
+            assert grasp.tool.kind == kinds[grasp.tool.number]
+            assert (grasp.tool.kind == "suction") == (grasp.open_m == grasp.close_m == 0)
+            assert grasp.open_m >= grasp.close_m
+            assert grasp.approach_m == (0.08 if grasp.tool.number == 3 else 0.06)
+            assert grasp.clearance_m >= job.recipe.limits.margin_m
+        assert [g.quality for g in result.grasps] == sorted((g.quality for g in result.grasps), reverse=True)
+        verdicts = [score.judge(paper.scene, pose(g), job.tool_numbered(g.tool.number), g.open_m, g.close_m)
+                    for g in result.grasps[:3] if g.tool.number == 8]
+        assert all(v.ok for v in verdicts), [v.reason for v in verdicts]

@@ -25,7 +25,7 @@ def block() -> Block:
     words[:20] = [5, 1, 77, 1, 0b110010, 0, 0, 1, 1, 3, 4, 1, 1, 1, 0, 0, 60, 250, 500, 0]
     words[20:22] = [5, 1]
     words[22:36] = struct.unpack(">14H", struct.pack(">7f", 100.0, -50.0, 950.0, 0.0, 0.0, 90.0, 0.0))
-    words[36:45] = [1, 1, 3, 900, 0, 0, 800, 30, 10]
+    words[36:45] = [1, 1, 3, 900, 562, 401, 800, 30, 10]
     return sealed(words)
 
 
@@ -49,6 +49,7 @@ def test_a_whole_block_is_believed() -> None:
     expected = [[0, -1, 0, 0.1], [1, 0, 0, -0.05], [0, 0, 1, 0.95], [0, 0, 0, 1]]
     np.testing.assert_allclose(record.T_frame_tcp, expected, atol=1e-7)
     assert (record.grasp_id, record.tool, record.quality, record.approach_m) == (1, 1, 0.9, 0.08)
+    assert (record.open_m, record.close_m) == (0.0562, 0.0401)
 
 
 def changed(index: int, word: int) -> Callable[[Block], None]:

@@ -31,7 +31,11 @@ def test_only_a_bin_is_required():
     (BIN + "publish: {modbus: null}\n", "control is modbus"),
     (BIN + "cameras: {backend: aravis, left: {}}\n", "cameras.left: .*address"),
     (BIN + "cameras: {backend: files, left: l.png, right: r.png, max_skew_us: 5}\n", "max_skew_us: unknown key"),
-    (BIN + "recipes: [{tools: [1, 1]}]\n", "recipes.0.tools: .*at most 1"),
+    (BIN + "recipes: [{tools: [1, 1]}]\n", "recipes.0: .*tools: every number may stand once"),
+    (BIN + "gripper: {kind: hook}\n", "tools.0: a tool's kind is suction or two_finger"),
+    (BIN + "gripper: {kind: two_finger, cups: [{}]}\n", "tools.0.cups: unknown key"),
+    (BIN + "gripper: {kind: two_finger, fingers: {stroke_min_m: 0.2}}\n", "tools.0.fingers: .*stroke_min_m must be below"),
+    (BIN + "gripper: {kind: two_finger, fingers: {pad_depth_m: 0.1}}\n", "pad_depth_m must not be above length_m"),
     (BIN + "recipes: [{limits: {reach: {min_m: [0, 0, 0], max_m: [1, 1, -1]}}}]\n", "min_m must be below max_m"),
     (BIN + "recipes: [{shots: []}]\n", "recipes.0.shots: .*at least 1"),
     (BIN + "recipes: [{shots: [{exposure_us: 5}]}]\n", "recipes.0.shots.0.exposure_us: .*20"),
@@ -97,6 +101,14 @@ def test_requests_choose_by_number():
     for wrong in ({"recipe": 7}, {"bin_number": 2}, {"tool": 3}):
         with pytest.raises(UnknownItem, match="the cell file has"):
             settings.resolve(cell, **wrong)
+
+
+def test_a_recipe_may_pick_with_several_tools_and_a_request_with_one():
+    cell = settings.parse(BIN + "tools: [{number: 1}, {number: 7, kind: two_finger}]\nrecipes: [{tools: [7, 1]}]\n", "c")
+    assert [tool.kind for tool in settings.resolve(cell).tools] == ["two_finger", "suction"]
+    assert [tool.number for tool in settings.resolve(cell, tool=1).tools] == [1]
+    assert settings.resolve(cell).tool_numbered(7).kind == "two_finger"
+    assert settings.Job.model_validate_json(settings.resolve(cell).model_dump_json()) == settings.resolve(cell)
 
 
 def test_settings_are_named_by_their_content():

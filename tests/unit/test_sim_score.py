@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from binpick import geometry
-from binpick.settings import Tool
+from binpick.settings import SuctionTool, TwoFingerTool
 from binpick.sim import score
 from binpick.sim.world import ScenePart, WorldScene
 
 TOP = 0.015
-TOOL = Tool()
+TOOL = SuctionTool()
+FINGERS = TwoFingerTool(kind="two_finger")
 BLOCK = WorldScene("A", (ScenePart(3, "block", geometry.translation(0.1, 0.05, 0.0075)),), 1, 1)
 
 
@@ -81,3 +82,52 @@ def test_pickable_leaves_out_what_no_cup_can_hold():
     found = score.pickable(scene, TOOL)
     assert {3, 5} <= found
     assert 2 not in found
+
+
+def pinched(x=0.1, y=0.05, z=0.004, turn_deg=0.0, open_m=0.05, scene=BLOCK, close_m=0.04):
+    """The verdict on fingers that close across the block's 40 mm."""
+    turn = np.radians(90 + turn_deg)
+    pose = geometry.frame_of_axes(np.array([0.0, 0.0, -1.0]), np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([x, y, z]))
+    return score.judge(scene, pose, FINGERS, open_m, close_m)
+
+
+def test_two_fingers_hold_a_block_across_its_sides():
+    verdict = pinched()
+    assert verdict.ok, verdict.reason
+    assert (verdict.part_id, verdict.kind, verdict.penetration_m) == (3, "block", 0)
+    assert verdict.angle_rad == pytest.approx(0, abs=1e-3)
+    assert verdict.distance_m == pytest.approx(0, abs=1e-5)
+    assert pinched(close_m=0.037).distance_m == pytest.approx(0.003, abs=1e-5)
+    assert pinched(turn_deg=180).ok, "half a turn about the approach is the same grip"
+    assert pinched(open_m=0.036).penetration_m == pytest.approx(0.002, abs=1e-6)
+
+
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"z": 0.02}, "nothing between"), ({"x": 0.2}, "nothing between"), ({"open_m": 0.09}, "cannot open"),
+    ({"turn_deg": 30, "open_m": 0.065}, "slips"), ({"z": -0.004}, "collides"),
+    ({"y": 0.057, "open_m": 0.05}, "collides"),
+])
+def test_what_is_wrong_with_a_pinch_is_said(changes, reason):
+    verdict = pinched(**changes)
+    assert not verdict.ok
+    assert reason in verdict.reason
+
+
+def test_a_neighbour_stops_the_fingers_on_their_way_in_and_when_they_close():
+    on_edge = geometry.frame_of_axes(np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.1, 0.086, 0.02]))
+    beside = WorldScene("A", (*BLOCK.parts, ScenePart(4, "block", on_edge)), 1, 1)
+    assert pinched(scene=beside).reason == "the tool collides"
+    # as wide as both, they meet one on either side
+    assert "one part" in pinched(scene=beside, y=0.062, open_m=0.07).reason
+
+
+def test_a_part_that_meets_the_fingers_above_their_pads_is_not_held():
+    bar_up = geometry.frame_of_axes(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.1, 0.05, 0.03]))
+    scene = WorldScene("A", (ScenePart(3, "tee", bar_up),), 1, 1)
+
+    def reason(z):
+        down = geometry.frame_of_axes(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.1, 0.05, z]))
+        return score.judge(scene, down, FINGERS, 0.069, 0.064).reason
+
+    # the bar hangs over the stem, from 44 mm up; a pad is 18 mm deep
+    assert (reason(0.04), reason(0.02)) == ("", "the part touches a finger above its pad")

@@ -32,6 +32,8 @@ def exam(
     cycles: Annotated[int, typer.Option(help="Timed cycles per scene.", min=1, max=100)] = 2,
     textbook: Annotated[bool, typer.Option(help="Also run the textbook pipeline (6 s a cycle).")] = True,
     tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
+    tool: Annotated[str, typer.Option(help="suction or two_finger; the textbook knows suction only.")] = "suction",
+    kinds: Annotated[str, typer.Option(help="The parts: mixed, metal, one kind, or several as in block+tee.")] = "mixed",
     modbus: Annotated[str, typer.Option(metavar="HOST:PORT", help="Time a daemon's Modbus reads instead (20 s).")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
@@ -44,13 +46,16 @@ def exam(
     from rich.console import Console
     from rich.progress import track
 
+    from binpick.errors import InputError
     from binpick.lab import grasps, report
     from binpick.sim import exam as frozen
 
+    if tool not in ("suction", "two_finger"):
+        raise InputError(f"--tool {tool}: there are suction and two_finger")
     seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
-    sitting = grasps.sit(world, seeds, cycles, textbook)
+    sitting = grasps.sit(world, seeds, cycles, textbook and tool == "suction", kinds=kinds, tool=tool)
     done = list(track(sitting, "Sitting the exam", total=len(seeds), console=Console(stderr=True), transient=True))
-    run = report.figures(world, done)
+    run = report.figures(world, done, kinds, tool)
     if as_json:
         typer.echo(json.dumps(run, indent=1))
     else:

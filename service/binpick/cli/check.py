@@ -109,8 +109,10 @@ def _tool(tool: "Tool") -> str:
     T_flange_tcp = tool.T_flange_tcp.T_parent_this
     position, turn = (", ".join(f"{number:g}" for number in numbers.round(4))
                       for numbers in (1000 * T_flange_tcp[:3, 3], geometry.quaternion(T_flange_tcp)))
-    return (f"{tool.name}: the robot's TCP is {position} mm, quaternion xyzw {turn} from its flange; its program presses "
-            f"{1000 * tool.compression_m:g} mm beyond the pose")
+    told = f"{tool.name}: the robot's TCP is {position} mm, quaternion xyzw {turn} from its flange; its program "
+    if tool.kind == "suction":
+        return f"{told}presses {1000 * tool.compression_m:g} mm beyond the pose"
+    return f"{told}opens the fingers to each pose's open, and closes them until they hold (at about its close)"
 
 
 def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:
@@ -120,7 +122,7 @@ def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:
 
     job = settings.resolve(cell, number)
     located = " (located by its rim)" if job.bin.locate else ""
-    seen = f"{job.recipe.name}: bin {job.bin.number}{located}, tool {job.tool.number}, poses in {job.recipe.frame}"
+    seen = f"{job.recipe.name}: bin {job.bin.number}{located}, tools {_numbers(job.tools)}, poses in {job.recipe.frame}"
     try:
         pipeline.admit(rig, job, Request())
     except FlangePoseMissing:

@@ -2,7 +2,7 @@
 
 The scene is the watertight height map as a solid: what is not seen is occupied, and so is all that lies below a seen surface
 or outside the bin below its rim. Over such a solid a straight lift never collides when the grasp itself is free, so
-only the approach is swept.
+only the approach is swept. Fingers come open and are boxes like the others; closed they stay within what they swept.
 """
 
 import functools
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float32, Float64
 
 from binpick import geometry
-from binpick.data import Grasp, HeightMap
-from binpick.geometry import Transform
-from binpick.settings import Bin, Body, Box, Tool
+from binpick.data import Grasp, HeightMap, Segments
+from binpick.geometry import Transform, Vector
+from binpick.settings import Bin, Body, Box, SuctionTool, Tool
+from binpick.settings.base import Placement
 
 PAD_M = 0.08
 """How far beyond the bin the rim's height is kept: as wide as a tool."""
@@ -26,6 +26,12 @@ SWEEP_STEP_M = 0.015
 """Distance of the tool's checked positions along the approach: less than any body is long in that direction."""
 HORIZON_M = 0.020
 """Clearances above this are reported as this."""
+BESIDE_M = 0.0045
+"""How far beyond a part's outline the next one is looked at: further than depth is missing at a step."""
+WALL_M = 0.006
+"""Points this near a wall may be the wall."""
+ABOVE_M = 0.004
+"""What stands this much higher there may lie on the part: four sigma of depth at 1 m."""
 CONTACT_M = 0.003
 """Points this little above the TCP's plane belong to the surface that is gripped."""
 
@@ -39,6 +45,15 @@ class Obstacles:
     cell_m: float
     origin_x_m: float
     origin_y_m: float
+
+    def within(self, points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points lie inside the bin's walls, and not on them; NaN does not."""
+        border = round(PAD_M / self.cell_m) * self.cell_m + WALL_M
+        rows, cols = self.height.shape
+        x, y = points[:, 0] - self.origin_x_m, points[:, 1] - self.origin_y_m
+        inside: Bool[np.ndarray, "n"] = (np.minimum(x, cols * self.cell_m - x) > border) & (
+            np.minimum(y, rows * self.cell_m - y) > border)
+        return inside
 
 
 def obstacles(heights: HeightMap, model: Bin) -> Obstacles:
@@ -56,33 +71,44 @@ def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
 
     Points of the gripped surface under the cup do not count: the cup's compliance takes them. At most HORIZON_M is told.
     """
-    local = geometry.transform(geometry.inverse(grasp.T_bin_tcp), _beneath(grasp.T_bin_tcp, tool, scene))
-    radial = np.hypot(local[:, 0], local[:, 1])
-    touched = (local[:, 2] > -CONTACT_M) & (radial < _foot_radius_m(tool) + HORIZON_M / 4)
-    local = local[~touched & _near_bodies(local, tool, tool.approach_m)]
-    # the tool standing back by s is the scene standing forward by s
-    swept = (local[None] - _backs(tool)[:, None]).reshape(-1, 3)
-    near = swept[_near_bodies(swept, tool, 0.0)]
-    if not len(near):
-        return HORIZON_M
-    distance = _solid(tool).compute_signed_distance(o3d.core.Tensor.from_numpy(near.astype(np.float32))).numpy()
-    return float(min(distance.min(), HORIZON_M))
+    T_tcp_bin = geometry.inverse(grasp.T_bin_tcp)
+    back = -tool.approach_m * grasp.T_bin_tcp[:3, 2]
+    nearest = HORIZON_M
+    for body in _bodies(tool, grasp.open_m):
+        corners = geometry.transform(grasp.T_bin_tcp, _placed(body)[1])
+        low, high = (np.minimum(0, back) + corners.min(axis=0), np.maximum(0, back) + corners.max(axis=0))
+        local = geometry.transform(T_tcp_bin, _beneath(low - HORIZON_M, high + HORIZON_M, scene))
+        if isinstance(tool, SuctionTool):
+            radial = np.hypot(local[:, 0], local[:, 1])
+            local = local[~((local[:, 2] > -CONTACT_M) & (radial < _foot_radius_m(tool) + HORIZON_M / 4))]
+        nearest = min(nearest, _distance(local, body, tool.approach_m))
+    return nearest
 
 
-def _beneath(T_bin_tcp: Transform, tool: Tool, scene: Obstacles) -> Float64[np.ndarray, "n 3"]:
-    """The solid's surface as points, tops and sides, in the rectangle of the bin's plane that the swept tool covers."""
-    reach = max(_extent(body)[0] for body in tool.bodies) + HORIZON_M
-    back = max(-_extent(body)[1] for body in tool.bodies) + tool.approach_m
-    ends = np.stack([T_bin_tcp[:2, 3], T_bin_tcp[:2, 3] - back * T_bin_tcp[:2, 2]])
+def _bodies(tool: Tool, open_m: float) -> tuple[Body, ...]:
+    """All of the tool; fingers stand `open_m` apart."""
+    if isinstance(tool, SuctionTool):
+        return tool.bodies
+    f = tool.fingers
+    x = (open_m + f.thickness_m) / 2
+    return tool.bodies + tuple(
+        Box(shape="box", size_m=(f.thickness_m, f.pad_width_m, f.length_m),
+            T_tcp_body=Placement(position_m=(side * x, 0.0, -f.length_m / 2))) for side in (-1, 1))
+
+
+def _beneath(low_m: Vector, high_m: Vector, scene: Obstacles) -> Float64[np.ndarray, "n 3"]:
+    """The solid's surface as points, tops and sides, in a box along the bin's axes; above the box' top it goes on."""
     origin = np.array([scene.origin_x_m, scene.origin_y_m])
     size = np.array(scene.height.shape[::-1])
-    low = np.clip(np.floor((ends.min(axis=0) - reach - origin) / scene.cell_m), 0, size - 1).astype(int)
-    high = np.clip(np.ceil((ends.max(axis=0) + reach - origin) / scene.cell_m), 1, size).astype(int)
+    low = np.clip(np.floor((low_m[:2] - origin) / scene.cell_m), 0, size - 1).astype(int)
+    high = np.clip(np.ceil((high_m[:2] - origin) / scene.cell_m), 1, size).astype(int)
     cells = slice(low[1], high[1]), slice(low[0], high[0])
     x = origin[0] + (np.arange(low[0], high[0]) + 0.5) * scene.cell_m
     y = origin[1] + (np.arange(low[1], high[1]) + 0.5) * scene.cell_m
     tops = np.stack([*np.meshgrid(x, y), scene.height[cells]], axis=-1).reshape(-1, 3)
-    count = np.floor(scene.side[cells].ravel() / SIDE_STEP_M).astype(int)
+    rises = tops[:, 2] > low_m[2]
+    tops = tops[rises]
+    count = np.floor(np.minimum(scene.side[cells].ravel()[rises], tops[:, 2] - low_m[2]) / SIDE_STEP_M).astype(int)
     sides = np.repeat(tops, count, axis=0)
     sides[:, 2] -= (np.arange(len(sides)) - np.repeat(np.cumsum(count) - count, count) + 1) * SIDE_STEP_M
     return np.concatenate([tops, sides])
@@ -96,8 +122,15 @@ def _backs(tool: Tool) -> Float64[np.ndarray, "s 3"]:
 
 def _extent(body: Body) -> tuple[float, float, float]:
     """Largest distance from the TCP's z axis, and lowest and highest z of its corners."""
-    corners = geometry.transform(body.T_tcp_body.T_parent_this, _corners(body))
+    corners = _placed(body)[1]
     return float(np.hypot(corners[:, 0], corners[:, 1]).max()), float(corners[:, 2].min()), float(corners[:, 2].max())
+
+
+@functools.lru_cache(maxsize=64)
+def _placed(body: Body) -> tuple[Transform, Float64[np.ndarray, "n 3"]]:
+    """T_tcp_body, and the body's corners in the TCP's frame."""
+    T_tcp_body = body.T_tcp_body.T_parent_this
+    return T_tcp_body, geometry.transform(T_tcp_body, _corners(body))
 
 
 def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
@@ -110,33 +143,58 @@ def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
     return np.concatenate([np.column_stack([ring, np.full(16, z)]) for z in (-half_length, half_length)])
 
 
-def _foot_radius_m(tool: Tool) -> float:
+def _foot_radius_m(tool: SuctionTool) -> float:
     """Radius of what comes down right above the lip."""
     return max([tool.cups[0].radius_m] + [r for r, _, high in map(_extent, tool.bodies) if high > -0.01])
 
 
-def _near_bodies(points: Float64[np.ndarray, "n 3"], tool: Tool, sweep_m: float) -> Bool[np.ndarray, "n"]:
-    """Points within HORIZON_M of some body's bounding cylinder about the TCP's axis, swept back by `sweep_m`."""
-    radial = np.hypot(points[:, 0], points[:, 1])
-    near = np.zeros(len(points), dtype=bool)
-    for radius, low, high in map(_extent, tool.bodies):
-        near |= (radial < radius + HORIZON_M) & (points[:, 2] > low - HORIZON_M - sweep_m) & (points[:, 2] < high + HORIZON_M)
-    return near
+def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float) -> float:
+    """Smallest signed distance of the points to a body and to all places that it passes on the approach; inf without points.
 
-
-@functools.lru_cache(maxsize=16)
-def _solid(tool: Tool) -> o3d.t.geometry.RaycastingScene:
-    """The tool's bodies as one Open3D scene for signed distances, frame TCP."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    for body in tool.bodies:
+    A body whose own z is the TCP's passes through a longer one of its kind; others are looked at in steps.
+    """
+    if not len(points):
+        return float("inf")
+    T_tcp_body, _ = _placed(body)
+    upright = abs(T_tcp_body[2, 2]) > 1 - 1e-9
+    longer_m = approach_m if upright else 0.0
+    steps = [approach_m / 2] if upright else np.linspace(0, approach_m, 1 + int(np.ceil(approach_m / SWEEP_STEP_M))).tolist()
+    nearest = []
+    for step in steps:
+        local = np.abs(geometry.transform(geometry.inverse(geometry.translation(0.0, 0.0, -step) @ T_tcp_body), points))
         if isinstance(body, Box):
-            mesh = o3d.geometry.TriangleMesh.create_box(*body.size_m)
-            mesh.translate(-np.array(body.size_m) / 2)
+            half = np.array(body.size_m) / 2
+            beyond = [local[:, 0] - half[0], local[:, 1] - half[1], local[:, 2] - half[2] - longer_m / 2]
         else:
-            mesh = o3d.geometry.TriangleMesh.create_cylinder(body.radius_m, body.length_m, 32, 1)
-        mesh.transform(body.T_tcp_body.T_parent_this)
-        scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-    return scene
+            beyond = [np.hypot(local[:, 0], local[:, 1]) - body.radius_m, local[:, 2] - (body.length_m + longer_m) / 2]
+        most = functools.reduce(np.maximum, beyond)
+        if (inside := float(most.min())) <= 0:
+            nearest.append(inside)
+            continue
+        near = most <= HORIZON_M
+        outside = [np.maximum(away[near], 0) for away in beyond]
+        nearest.append(float(np.sqrt(sum(away * away for away in outside).min(initial=np.inf))))
+    return float(np.min(nearest))
+
+
+def covered(segments: Segments, scene: Obstacles) -> dict[int, float]:
+    """The share of each part's outline, as seen, beside which something stands higher: there it may go on underneath.
+
+    A part under another takes it along, or loses its hold, on the way up; no height map shows that. Walls do not count.
+    """
+    parts, xyz, cols = segments.parts.ravel(), segments.xyz.reshape(-1, 3), segments.parts.shape[1]
+    pixels = np.flatnonzero(parts)
+    spacing_m = np.linalg.norm(np.take(xyz, pixels[::8] + 1, axis=0, mode="clip") - xyz[pixels[::8]], axis=1)
+    beyond = max(2, round(BESIDE_M / max(float(np.nanmedian(spacing_m)), 1e-4))) if len(pixels) else 2
+    border = np.zeros(int(parts.max(initial=0)) + 1, dtype=np.int64)
+    under = np.zeros_like(border)
+    for step in (1, -1, cols, -cols):
+        edge = pixels[np.take(parts, pixels + step, mode="clip") != parts[pixels]]
+        there = np.clip(edge + beyond * step, 0, len(parts) - 1)
+        higher = (parts[there] != parts[edge]) & (xyz[there, 2] - xyz[edge, 2] > ABOVE_M) & scene.within(xyz[there])
+        border += np.bincount(parts[edge], minlength=len(border))
+        under += np.bincount(parts[edge[higher]], minlength=len(border))
+    return {label: float(under[label] / max(border[label], 1)) for label in segments.part_points}
 
 
 def blocked(grasps: list[Grasp], tool: Tool, heights: HeightMap) -> Bool[np.ndarray, "n"]:
@@ -149,12 +207,12 @@ def blocked(grasps: list[Grasp], tool: Tool, heights: HeightMap) -> Bool[np.ndar
     local = (_shell(tool)[None] + _backs(tool)[:, None]).reshape(-1, 3)
     T_bin_tcp = np.stack([grasp.T_bin_tcp for grasp in grasps])
     points = np.matmul(local, T_bin_tcp[:, :3, :3].transpose(0, 2, 1)) + T_bin_tcp[:, None, :3, 3]
-    height = _height_at(points.reshape(-1, 3), heights).reshape(points.shape[:2])
+    height = height_at(points.reshape(-1, 3), heights).reshape(points.shape[:2])
     hit: Bool[np.ndarray, "n"] = (height > points[..., 2]).any(axis=1)
     return hit
 
 
-def _height_at(points: Float64[np.ndarray, "n 3"], heights: HeightMap) -> Float32[np.ndarray, "n"]:
+def height_at(points: Float64[np.ndarray, "n 3"], heights: HeightMap) -> Float32[np.ndarray, "n"]:
     """The solid's height under each point; nothing outside the map (the exact check knows the rim)."""
     rows, cols = heights.watertight.shape
     j = np.floor((points[:, 0] - heights.origin_x_m) / heights.cell_m).astype(int)

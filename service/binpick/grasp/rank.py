@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from binpick.data import Grasp, Segments
-from binpick.settings import Tool
+from binpick.settings import SuctionTool, Tool
 
 WEIGHTS = {"height": 0.45, "area": 0.20, "upright": 0.20, "centre": 0.15}
 """Shares of what is wanted; they sum to 1. Height frees the parts below."""
@@ -18,14 +18,25 @@ PER_PART = 2
 """At most this many grasps of one part."""
 
 
-def rank(grasps: list[Grasp], segments: Segments, tool: Tool) -> list[Grasp]:
-    """Best first, with qualities, without near-duplicates, at most two per part."""
+def rank(grasps: list[Grasp], segments: Segments, *tools: Tool) -> list[Grasp]:
+    """Best first, with qualities, without near-duplicates, at most two per part; `tools` are those the grasps are for."""
+    kept: list[Grasp] = []
+    for grasp in ordered(grasps, segments, *tools):
+        if adds(grasp, kept):
+            kept.append(grasp)
+    return kept
+
+
+def ordered(grasps: list[Grasp], segments: Segments, *tools: Tool) -> list[Grasp]:
+    """Best first, with qualities."""
+    by_number = {tool.number: tool for tool in tools}
     area_px = {label: len(points) for label, points in segments.part_points.items()}
     centre = {label: points.mean(axis=0) for label, points in segments.part_points.items()}
     largest = max(area_px.values(), default=1)
     top = max((float(g.T_bin_tcp[2, 3]) for g in grasps), default=0.0)
     scored = []
     for grasp in grasps:
+        tool = by_number[grasp.tool]
         offset = float(np.linalg.norm(grasp.T_bin_tcp[:3, 3] - centre[grasp.part_id]))
         tilt = float(np.arccos(np.clip(-grasp.T_bin_tcp[2, 2], -1, 1)))
         terms = {
@@ -34,11 +45,17 @@ def rank(grasps: list[Grasp], segments: Segments, tool: Tool) -> list[Grasp]:
             "upright": 1 - tilt / max(tool.max_tilt_rad, 1e-6) if tool.max_tilt_rad else 1.0,
             "centre": float(np.clip(1 - offset / 0.03, 0, 1)),
         }
-        doubts = {"seal": min(1.0, grasp.seal_m / tool.compliance_m), "room": 1 - grasp.room}
         quality = segments.part_confidence[grasp.part_id] * sum(WEIGHTS[name] * value for name, value in terms.items())
-        quality *= float(np.prod([1 - DOUBTS[name] * value for name, value in doubts.items()]))
-        scored.append(replace(grasp, quality=round(float(np.clip(quality, 0, 1)), 3)))
-    return _distinct(sorted(scored, key=_key))
+        scored.append(replace(grasp, quality=round(float(np.clip(quality * _hold(grasp, tool), 0, 1)), 3)))
+    return sorted(scored, key=_key)
+
+
+def _hold(grasp: Grasp, tool: Tool) -> float:
+    """What the tool's own doubts leave of a quality."""
+    if not isinstance(tool, SuctionTool):
+        return 1 - grasp.doubt
+    doubts = {"seal": min(1.0, grasp.seal_m / tool.compliance_m), "room": 1 - grasp.room}
+    return float(np.prod([1 - DOUBTS[name] * value for name, value in doubts.items()]))
 
 
 def _key(grasp: Grasp) -> tuple[float, ...]:
@@ -47,13 +64,10 @@ def _key(grasp: Grasp) -> tuple[float, ...]:
     return (-grasp.quality, -z, x, y, *np.round(grasp.T_bin_tcp[:3, 2], 2).tolist())
 
 
-def _distinct(ordered: list[Grasp]) -> list[Grasp]:
-    kept: list[Grasp] = []
-    for grasp in ordered:
-        mine = [other for other in kept if other.part_id == grasp.part_id]
-        if len(mine) < PER_PART and not any(_alike(grasp, other) for other in mine):
-            kept.append(grasp)
-    return kept
+def adds(grasp: Grasp, kept: list[Grasp]) -> bool:
+    """Whether a grasp is one more way to pick, beside those kept."""
+    mine = [other for other in kept if other.part_id == grasp.part_id]
+    return len(mine) < PER_PART and not any(_alike(grasp, other) for other in mine)
 
 
 def _alike(a: Grasp, b: Grasp) -> bool:

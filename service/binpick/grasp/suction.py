@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 from binpick import geometry
 from binpick.data import Grasp, Labels, Segments
 from binpick.geometry import Transform
-from binpick.settings import Tool
+from binpick.settings import SuctionTool
 
 FIT_RADIUS = 1.1
 """The plane is fitted, and the seal judged, within this many lip radii."""
@@ -34,7 +34,8 @@ class Patch:
     own: Bool[np.ndarray, "n k"]
 
 
-def candidates(segments: Segments, tool: Tool, sigma_z_m: Float32[np.ndarray, "h w"]) -> tuple[list[Grasp], dict[str, int]]:
+def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndarray, "h w"],
+               ) -> tuple[list[Grasp], dict[str, int]]:
     """All grasps whose lip seals and whose tilt the tool allows, and how many spots fell out for which reason.
 
     Qualities are 0 until ranked. The pose's z points into the part, x along the part's longest extent.
@@ -218,7 +219,7 @@ def _long_axes(segments: Segments) -> dict[int, geometry.Vector]:
 
 
 def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal, T_bin_spot: Float64[np.ndarray, "n 4 4"],
-           long_axes: dict[int, geometry.Vector], tool: Tool, sigma_z_m: Float32[np.ndarray, "h w"]) -> Grasp:
+           long_axes: dict[int, geometry.Vector], tool: SuctionTool, sigma_z_m: Float32[np.ndarray, "h w"]) -> Grasp:
     row, col = int(spots[i, 0]), int(spots[i, 1])
     part = int(segments.parts[row, col])
     normal = seal.normal_bin(T_bin_spot)[i]

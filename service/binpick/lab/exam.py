@@ -43,13 +43,13 @@ def renderer(world: str) -> Renderer:
 
 
 def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin",
-          projector: bool | None = None, shots: tuple[Shot, ...] = ()) -> Paper:
+          projector: bool | None = None, shots: tuple[Shot, ...] = (), tool: str = "suction") -> Paper:
     """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame.
 
-    `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own.
+    `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own; `tool` is the kind of the default tool.
     """
     scene = World(world, kinds, parts, seed).scene()
-    job = settings.resolve(exam.cell(world), recipe)
+    job = settings.resolve(exam.cell(world, tools=[{"kind": tool}]), recipe)
     changes = ({} if projector is None else {"projector": projector}) | ({"shots": shots} if shots else {})
     if changes:
         job = job.model_copy(update={"recipe": Recipe.model_validate(job.recipe.model_dump() | changes)})

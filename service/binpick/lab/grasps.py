@@ -12,8 +12,18 @@ from binpick.geometry import Transform
 from binpick.lab import baseline, exam, stereo
 from binpick.lab.exam import Paper
 from binpick.lab.stereo import DepthScore
-from binpick.result import CycleResult
+from binpick.result import CycleResult, GraspMessage
 from binpick.sim import score
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """A grasp as the robot takes it: the pose in the bin, the tool's number, and how far two fingers open and close."""
+
+    T_bin_tcp: Transform
+    tool: int
+    open_m: float = 0.0
+    close_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +54,21 @@ class Scene:
     textbook_window: Answer | None = None
 
 
-def sit(world: str, seeds: Iterable[int], cycles: int, against_textbook: bool) -> Iterator[Scene]:
-    """Sits the exam, one scene at a time; `cycles` timed repetitions of ours, of which the median counts."""
+def sit(world: str, seeds: Iterable[int], cycles: int, against_textbook: bool, *, kinds: str = "mixed",
+        tool: str = "suction") -> Iterator[Scene]:
+    """Sits the exam, one scene at a time; `cycles` timed repetitions of ours, of which the median counts.
+
+    `kinds` and `tool` as in `exam.paper`; the textbook knows suction only.
+    """
     for seed in seeds:
-        paper = exam.paper(world, seed)
+        paper = exam.paper(world, seed, kinds=kinds, tool=tool)
         outcome, seconds, stages = _ours(paper, cycles)
         if outcome.rectified is None or outcome.depth is None:
             raise RuntimeError("a settled world always has depth")
         view = outcome.rectified.window
         truth = paper.truth(view)
         on_part = truth.part_id > 0
-        good, depths = judged(paper, [_T_bin_tcp(paper, g.position_m, g.quaternion_xyzw) for g in outcome.result.grasps])
+        good, depths = judged(paper, [_taken(grasp) for grasp in outcome.result.grasps])
         ours = Answer(
             stereo.score(outcome.depth.disparity, truth.disparity, on_part, truth.visible_both), good, depths, seconds
         )
@@ -91,19 +105,22 @@ def _textbook(paper: Paper, view: Window | None) -> Answer:
     book = baseline.run(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, T_camera_bin, inputs.job.bin, view)
     truth = paper.truth(book.window)
     disparity = np.where(book.disparity > 0, book.disparity, np.float32(np.nan)).astype(np.float32)
-    good, depths = judged(paper, book.grasps[:5])
+    good, depths = judged(paper, [Taken(T_bin_tcp, inputs.job.tool.number) for T_bin_tcp in book.grasps[:5]])
     depth = stereo.score(disparity, truth.disparity, truth.part_id > 0, truth.visible_both)
     return Answer(depth, good, depths, (book.seconds["total"],))
 
 
-def judged(paper: Paper, grasps: Sequence[Transform]) -> tuple[tuple[bool, ...], tuple[float, ...]]:
-    """The judge's verdict on each T_bin_tcp, and how deep the tool would go into something, metres."""
-    verdicts = [score.judge(paper.scene, T_bin_tcp, paper.inputs.job.tool) for T_bin_tcp in grasps]
+def judged(paper: Paper, grasps: Sequence[Taken]) -> tuple[tuple[bool, ...], tuple[float, ...]]:
+    """The judge's verdict on each grasp, and how deep the tool would go into something, metres."""
+    job = paper.inputs.job
+    verdicts = [score.judge(paper.scene, grasp.T_bin_tcp, job.tool_numbered(grasp.tool), grasp.open_m, grasp.close_m)
+                for grasp in grasps]
     return tuple(v.ok for v in verdicts), tuple(v.penetration_m for v in verdicts)
 
 
-def _T_bin_tcp(paper: Paper, position_m: tuple[float, ...], quaternion_xyzw: tuple[float, ...]) -> Transform:
-    """The published pose; the exam asks for frame `bin`."""
-    if paper.inputs.request.frame != "bin":
+def _taken(grasp: GraspMessage) -> Taken:
+    """The published grasp; the exam asks for frame `bin`."""
+    if grasp.frame != "bin":
         raise ValueError("the exam's papers are answered in the bin's frame")
-    return geometry.from_quaternion(np.array(position_m), np.array(quaternion_xyzw))
+    T_bin_tcp = geometry.from_quaternion(np.array(grasp.position_m), np.array(grasp.quaternion_xyzw))
+    return Taken(T_bin_tcp, grasp.tool.number, grasp.open_m, grasp.close_m)

@@ -14,7 +14,7 @@ from binpick.sim import exam as tables
 from binpick.sim import score
 
 
-def figures(world: str, scenes: Sequence[Scene]) -> dict[str, Any]:
+def figures(world: str, scenes: Sequence[Scene], kinds: str = "mixed", tool: str = "suction") -> dict[str, Any]:
     """All figures of a run."""
     book = [s.textbook for s in scenes if s.textbook is not None]
     windowed = [s.textbook_window for s in scenes if s.textbook_window is not None]
@@ -25,6 +25,8 @@ def figures(world: str, scenes: Sequence[Scene]) -> dict[str, Any]:
     return {
         "exam_sha256": tables.sha256(),
         "world": world,
+        "kinds": kinds,
+        "tool": tool,
         "seeds": [s.seed for s in scenes],
         "plain_sgbm": _depth([s.plain for s in scenes]),
         "rows": rows,
@@ -71,7 +73,8 @@ def table(run: dict[str, Any]) -> Group:
         "bad-2",
         "median |Δd|",
         "density",
-        title=f"Exam world {run['world']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, tables {run['exam_sha256'][:12]}",
+        title=f"Exam world {run['world']}, {run['kinds']}, {run['tool']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, "
+        f"tables {run['exam_sha256'][:12]}",
     )
     depth.add_row(
         "difficulty", f"{plain['bad1']:.1%}", f"{plain['bad2']:.1%}", f"{plain['median_px']:.3f} px", f"{plain['density']:.1%}"

@@ -64,9 +64,9 @@ class Echo:
 
     @classmethod
     def of(cls, request: Request, job: Job) -> "Echo":
-        """The request with the recipe's own in the place of every 0."""
+        """The request with the recipe's own in the place of every 0; the tool stays 0 where the recipe has several."""
         return cls(job.recipe.number, job.bin.number, FRAMES.index(request.frame or job.recipe.frame) + 1,
-                   PoseFormat[request.pose_format or job.recipe.pose_format], job.tool.number)
+                   PoseFormat[request.pose_format or job.recipe.pose_format], job.tool.number if len(job.tools) == 1 else 0)
 
 
 NO_ECHO = Echo()

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from binpick.settings.base import Strict
 from binpick.settings.recipe import Bin, Recipe
-from binpick.settings.tool import Tool
+from binpick.settings.tool import SuctionTool, Tool
 
 Port = Annotated[int, Field(ge=1, le=65535)]
 
@@ -99,7 +99,7 @@ class Cell(Strict):
 
     bins: Annotated[tuple[Bin, ...], Field(min_length=1)]
     """The load carriers."""
-    tools: Annotated[tuple[Tool, ...], Field(min_length=1)] = (Tool(),)
+    tools: Annotated[tuple[Tool, ...], Field(min_length=1)] = (SuctionTool(),)
     """The tools; also `gripper:` for a single one."""
     recipes: Annotated[tuple[Recipe, ...], Field(min_length=1)] = (Recipe(),)
     """The recipes; the first is the default."""

@@ -50,7 +50,7 @@ SENTENCES = {"extra_forbidden": "unknown key", "union_tag_not_found": "say which
 
 
 def _say(name: str, tree: yaml.Node | None, item: Any) -> str:
-    loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder")]
+    loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder", "suction", "two_finger")]
     key = ".".join(str(part) for part in loc)
     message = SENTENCES.get(item["type"], str(item["msg"]))
     given = f" (it is {item['input']!r})" if isinstance(item.get("input"), int | float | str) else ""

@@ -108,8 +108,8 @@ class Recipe(Strict):
     """For people."""
     bin: Number | None = None
     """Bin to pick from; the first one when absent."""
-    tools: Annotated[tuple[Number, ...], Field(max_length=1)] = ()
-    """The tool to pick with; the first one of the cell when empty."""
+    tools: Annotated[tuple[Number, ...], Field(max_length=4)] = ()
+    """The tools to pick with, of which each grasp names the one it is for; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
     stereo: Stereo = PRESETS["quality"]
@@ -133,6 +133,12 @@ class Recipe(Strict):
     pose_format: Literal["quaternion_xyzw", "rotvec_rad", "kuka_abc_deg", "fanuc_wpr_deg", "ur_rxryrz_rad"] = (
         "quaternion_xyzw")
     """Orientation on Modbus when the request names none."""
+
+    @model_validator(mode="after")
+    def _different_tools(self) -> "Recipe":
+        if len(set(self.tools)) != len(self.tools):
+            raise ValueError(f"tools: every number may stand once, got {list(self.tools)}")
+        return self
 
     @model_validator(mode="after")
     def _measurable(self) -> "Recipe":

@@ -1,14 +1,14 @@
 """How deep a tool's bodies go into parts and bin along the only motion that is checked: pre-grasp, grasp, lift."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from binpick import geometry
 from binpick.geometry import Transform
-from binpick.settings import Tool
+from binpick.settings import Fingers, SuctionTool, Tool
 from binpick.sim import exam
 from binpick.sim.world import WorldScene
 
@@ -61,20 +61,41 @@ class Prism:
                           for p, q in edges])
 
 
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """Two fingers' work: the opening they come with, where along the closing axis the pads then stand, and what they hold."""
+
+    open_m: float
+    low_m: float
+    high_m: float
+    part_id: int
+
+
 class Surroundings:
     """All that a tool can run into in one frozen scene."""
 
     def __init__(self, scene: WorldScene) -> None:
-        self._parts, self._setup = scene.parts, exam.setup(scene.world)
+        self._scene, self._parts, self._setup = scene, scene.parts, exam.setup(scene.world)
         self._points = _obstacles(scene)
         self._top = float(self._points[:, 2].max())
 
-    def penetration(self, T_bin_tcp: Transform, tool: Tool) -> float:
+    def penetration(self, T_bin_tcp: Transform, tool: Tool, grip: Grip | None = None) -> float:
         """The largest depth in metres of any body of the tool inside a part or the bin, on the way in and out; 0 when clear.
 
-        What lies beside the bin below its rim counts as solid: a body there has gone through a wall.
+        What lies beside the bin below its rim counts as solid: a body there has gone through a wall. Fingers come open and
+        leave closed; the part between them then leaves too. Without a grip they stay as wide as they are.
         """
-        motion, bodies = _motion(T_bin_tcp, tool), _bodies(tool)
+        way_in, way_out = _way_in(T_bin_tcp, tool), _way_out(T_bin_tcp, tool)
+        if isinstance(tool, SuctionTool):
+            return self.deepest(_bodies(tool), way_in + way_out)
+        grip = grip or Grip(tool.fingers.stroke_max_m, -tool.fingers.stroke_max_m / 2, tool.fingers.stroke_max_m / 2, 0)
+        coming = self.deepest(_bodies(tool) + _fingers(tool.fingers, -grip.open_m / 2, grip.open_m / 2), way_in)
+        left = replace(self._scene, parts=tuple(part for part in self._parts if part.part_id != grip.part_id))
+        leaving = _bodies(tool) + _fingers(tool.fingers, grip.low_m, grip.high_m)
+        return max(coming, Surroundings(left).deepest(leaving, way_out))
+
+    def deepest(self, bodies: list[tuple[Prism, Transform]], motion: list[Transform]) -> float:
+        """The largest depth of these bodies, given in the TCP's frame, at these places of the TCP; 0 when clear."""
         return max([0.0, *(self._of_body(*body, motion) for body in bodies)])
 
     def _of_body(self, prism: Prism, T_tcp_body: Transform, motion: list[Transform]) -> float:
@@ -100,9 +121,19 @@ class Surroundings:
         return max(depths)
 
 
-def _motion(T_bin_tcp: Transform, tool: Tool) -> list[Transform]:
-    way_in = [T_bin_tcp @ geometry.translation(0.0, 0.0, -s) for s in _spaced(0.0, tool.approach_m, STEP_M)]
-    return way_in + [geometry.translation(0.0, 0.0, s) @ T_bin_tcp for s in _spaced(0.0, tool.lift_m, STEP_M)[1:]]
+def _way_in(T_bin_tcp: Transform, tool: Tool) -> list[Transform]:
+    return [T_bin_tcp @ geometry.translation(0.0, 0.0, -s) for s in _spaced(0.0, tool.approach_m, STEP_M)]
+
+
+def _way_out(T_bin_tcp: Transform, tool: Tool) -> list[Transform]:
+    return [geometry.translation(0.0, 0.0, s) @ T_bin_tcp for s in _spaced(0.0, tool.lift_m, STEP_M)[1:]]
+
+
+def _fingers(fingers: Fingers, low_m: float, high_m: float) -> list[tuple[Prism, Transform]]:
+    """Both fingers with their pads' faces at these places along the TCP's x."""
+    prism = Prism("box", (fingers.thickness_m, fingers.pad_width_m, fingers.length_m))
+    return [(prism, geometry.translation(x, 0.0, -fingers.length_m / 2))
+            for x in (low_m - fingers.thickness_m / 2, high_m + fingers.thickness_m / 2)]
 
 
 def _bodies(tool: Tool) -> list[tuple[Prism, Transform]]:

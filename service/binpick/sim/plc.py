@@ -37,6 +37,8 @@ class PlcRecord:
     T_frame_tcp: Transform
     tool: int
     quality: float
+    open_m: float
+    close_m: float
     approach_m: float
 
 
@@ -157,7 +159,8 @@ class Plc:
         x, y, z, *numbers = (self._float(words[i], words[i + 1]) for i in range(2, 16, 2))
         R = _rotation(numbers, pose_format).as_matrix()
         return PlcRecord(grasp_id=words[1], T_frame_tcp=geometry.make(R, np.array([x, y, z]) / 1000), tool=words[17],
-                         quality=words[19] / 1000, approach_m=words[22] / 10000)
+                         quality=words[19] / 1000, open_m=words[20] / 10000, close_m=words[21] / 10000,
+                         approach_m=words[22] / 10000)
 
     def _float(self, first: int, second: int) -> float:
         high, low = (first, second) if self._word_order == "ABCD" else (second, first)

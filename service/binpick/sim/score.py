@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from binpick.geometry import Transform, frame_of_axes
-from binpick.settings import Tool
-from binpick.sim import exam
-from binpick.sim.collision import Surroundings
+from binpick.settings import SuctionTool, Tool
+from binpick.sim import exam, pinch
+from binpick.sim.collision import Grip, Surroundings
 from binpick.sim.mesh import Caster
 from binpick.sim.world import WorldScene
 
@@ -29,6 +29,8 @@ class Verdict:
 
     `distance_m` is from the TCP to the true surface along the approach (positive: the TCP hangs above it), `angle_rad`
     between approach and true surface, `ring_rms_m` how far the surface under the lip is from flat; all NaN without a part.
+    Of two fingers, `distance_m` is how far the part is wider than was said, `angle_rad` the larger of both contacts' angles to
+    the closing axis, `ring_rms_m` NaN.
     """
 
     part_id: int
@@ -43,7 +45,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """What lies under the cups: the part under the middle (0: none), and how they would sit on it."""
+    """What lies under the cups, or between the fingers: the part (0: none), and how they would sit on it."""
 
     part_id: int
     reason: str
@@ -52,16 +54,22 @@ class Contact:
     rms_m: float = float("nan")
 
 
-def judge(scene: WorldScene, T_bin_tcp: Transform, tool: Tool) -> Verdict:
-    """The verdict on one suction grasp; z of the TCP into the part."""
-    contact = _contacts(Caster(scene), T_bin_tcp[None], tool)[0]
-    depth = Surroundings(scene).penetration(T_bin_tcp, tool)
+def judge(scene: WorldScene, T_bin_tcp: Transform, tool: Tool, open_m: float = 0.0, close_m: float = 0.0) -> Verdict:
+    """The verdict on one grasp; z of the TCP into the part. Two fingers come `open_m` wide and expect a part of `close_m`."""
+    grip = None
+    if isinstance(tool, SuctionTool):
+        contact = _contacts(Caster(scene), T_bin_tcp[None], tool)[0]
+    else:
+        met = pinch.close(Caster(scene), T_bin_tcp, tool.fingers, open_m)
+        grip = Grip(open_m, met.low_m, met.high_m, met.part_id)
+        contact = Contact(met.part_id, met.reason, met.high_m - met.low_m - close_m, met.angle_rad)
+    depth = Surroundings(scene).penetration(T_bin_tcp, tool, grip)
     reason = contact.reason or ("the tool collides" if depth > MAX_PENETRATION_M else "")
     kind = next((p.kind for p in scene.parts if p.part_id == contact.part_id), "")
     return Verdict(contact.part_id, kind, not reason, reason, contact.distance_m, contact.angle_rad, contact.rms_m, depth)
 
 
-def pickable(scene: WorldScene, tool: Tool) -> frozenset[int]:
+def pickable(scene: WorldScene, tool: SuctionTool) -> frozenset[int]:
     """The parts that some grasp of this tool could take: along the surface normal, or straight down, anywhere seen from above.
 
     Every part gets up to TRIES_PER_PART collision checks, spread over the places where the cup would seal. Takes some seconds.
@@ -78,7 +86,7 @@ def pickable(scene: WorldScene, tool: Tool) -> frozenset[int]:
         if any(around.penetration(pose, tool) <= MAX_PENETRATION_M for pose in tries[::max(1, len(tries) // TRIES_PER_PART)]))
 
 
-def _candidates(scene: WorldScene, caster: Caster, tool: Tool) -> Float[np.ndarray, "n 4 4"]:
+def _candidates(scene: WorldScene, caster: Caster, tool: SuctionTool) -> Float[np.ndarray, "n 4 4"]:
     length, width, height = exam.setup(scene.world).bin_size_m
     x, y = np.meshgrid(np.arange(-length / 2, length / 2, GRID_M), np.arange(-width / 2, width / 2, GRID_M))
     rays = np.zeros((x.size, 6), np.float32)
@@ -92,7 +100,7 @@ def _candidates(scene: WorldScene, caster: Caster, tool: Tool) -> Float[np.ndarr
     return np.array(poses).reshape(-1, 4, 4)
 
 
-def _contacts(caster: Caster, poses: Float[np.ndarray, "n 4 4"], tool: Tool) -> list[Contact]:
+def _contacts(caster: Caster, poses: Float[np.ndarray, "n 4 4"], tool: SuctionTool) -> list[Contact]:
     """What the lips of each pose meet, by rays along the approach."""
     lips = _lips(tool)
     origins = np.einsum("nij,rj->nri", poses[:, :3, :3], lips - [0, 0, START_M]) + poses[:, None, :3, 3]
@@ -103,14 +111,15 @@ def _contacts(caster: Caster, poses: Float[np.ndarray, "n 4 4"], tool: Tool) -> 
     return [_contact(rays[i], distance[i], part_id[i], tool) for i in range(len(poses))]
 
 
-def _lips(tool: Tool) -> Float[np.ndarray, "n 3"]:
+def _lips(tool: SuctionTool) -> Float[np.ndarray, "n 3"]:
     """The TCP, then points on every lip, in the TCP's frame."""
     angles = np.arange(RING_RAYS) * 2 * np.pi / RING_RAYS
     ring = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RING_RAYS)])
     return np.vstack([np.zeros((1, 3)), *(ring * cup.radius_m + [cup.x_m, cup.y_m, 0] for cup in tool.cups)])
 
 
-def _contact(rays: Float32[np.ndarray, "n 6"], distance: Float32[np.ndarray, "n"], part_id: np.ndarray, tool: Tool) -> Contact:
+def _contact(rays: Float32[np.ndarray, "n 6"], distance: Float32[np.ndarray, "n"], part_id: np.ndarray,
+             tool: SuctionTool) -> Contact:
     part, gap = int(part_id[0]), float(distance[0]) - START_M
     if part <= 0:
         return Contact(0, "there is no part")

@@ -30,9 +30,9 @@ class Twin:
         """What a camera's sensor reads out."""
         return self._renderer.expose(self._scene, index, light, shot)
 
-    def move(self, T_base_tcp: Transform, tool: Tool) -> Verdict:
+    def move(self, T_base_tcp: Transform, tool: Tool, open_m: float = 0.0, close_m: float = 0.0) -> Verdict:
         """Sends the tool there; a part that it can pick leaves the bin, and the others find their places."""
-        verdict = score.judge(self._scene, self._T_bin_base @ T_base_tcp, tool)
+        verdict = score.judge(self._scene, self._T_bin_base @ T_base_tcp, tool, open_m, close_m)
         if verdict.ok:
             self._world.remove(verdict.part_id)
             self._world.settle()
