@@ -20,7 +20,7 @@ def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSetti
     """Faces and parts inside the bin and above its floor."""
     of_interest = _inside(surface, model)
     faces, parts = METHODS[settings.method](surface, of_interest, settings)
-    spacing_m = _spacing(surface, of_interest)
+    spacing_m = grid.spacing(surface, of_interest)
     least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
     faces, parts = _drop_small(faces, least), _drop_small(parts, least)
     masks = {label: (box, parts[box] == label) for label, box in enumerate(ndimage.find_objects(parts), 1)}
@@ -38,13 +38,6 @@ def _inside(surface: Surface, model: Bin) -> Mask:
         above = z > np.maximum(np.float32(FLOOR_M / 2), 3 * surface.sigma_z_m)
         inside = (np.abs(x) < length / 2 - WALL_M) & (np.abs(y) < width / 2 - WALL_M)
     return np.asarray(above & inside & np.isfinite(surface.normal[..., 0]))
-
-
-def _spacing(surface: Surface, of_interest: Mask) -> float:
-    """Median distance of neighbouring points, metres; 0 when there are none."""
-    both = of_interest[:, 1:] & of_interest[:, :-1]
-    step = np.linalg.norm(surface.xyz[:, 1:][both] - surface.xyz[:, :-1][both], axis=-1)
-    return float(np.median(step)) if step.size else 0.0
 
 
 def _drop_small(labels: Labels, least: int) -> Labels:

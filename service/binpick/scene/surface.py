@@ -30,6 +30,10 @@ class Surface:
     normal: Cloud
     sigma_z_m: Float32[np.ndarray, "h w"]
 
+    def cut(self, box: tuple[slice, slice]) -> "Surface":
+        """Its rows and columns in a box."""
+        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box])
+
 
 def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surface:
     """The surface of the window at half resolution."""

@@ -1,0 +1,95 @@
+"""How the surface goes on across a short way: in steps and in bends, and how regions that touch do so along their border.
+
+Two points a few millimetres apart lie above or below each other's tangent planes. Where one surface goes on both are zero; at a
+fold both points lie on the same side, at a step on opposite sides. This holds whatever lies between the two, so a border that is
+measured a pixel off, or as a ramp, does not hide what it separates.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from binpick.data import Labels, Mask
+from binpick.scene.surface import Surface
+
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+"""Rows and columns of the ways: right, down, and both diagonals."""
+
+Grid = tuple[slice, slice]
+Field = Float32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ways:
+    """All ways of one direction: what lies at their start, middle and end, and the surface between.
+
+    `step_m` is how far the end lies above the start's surface; `bend_m` is positive at concave folds. Both are defined where
+    `known` holds. `sigma_m` is the lesser depth noise of the two ends.
+    """
+
+    start: Grid
+    middle: Grid
+    end: Grid
+    known: Bool[np.ndarray, "h w"]
+    step_m: Field
+    bend_m: Field
+    sigma_m: Field
+
+
+def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
+    """The ways of all directions, `half_px` pixels to either side of their middle."""
+    xyz, normal = (np.ascontiguousarray(field.transpose(2, 0, 1)) for field in (surface.xyz, surface.normal))
+    found = []
+    for down, right in DIRECTIONS:
+        far = half_px if not down * right else max(1, round(half_px / 2**0.5))
+        start, middle, end = _grids(down * far, right * far, of_interest.shape)
+        above = below = np.float32(0)
+        for axis in range(3):
+            step = xyz[axis][end] - xyz[axis][start]
+            above, below = above + normal[axis][start] * step, below - normal[axis][end] * step
+        half = np.float32(0.5)
+        found.append(Ways(start, middle, end, of_interest[start] & of_interest[end], (above - below) * half,
+                          (above + below) * half, np.minimum(surface.sigma_z_m[start], surface.sigma_z_m[end])))
+    return found
+
+
+def _grids(down: int, right: int, shape: tuple[int, ...]) -> tuple[Grid, Grid, Grid]:
+    """Where ways start, their middles and their ends, for a step to either side."""
+    rows, cols = shape
+    aside = abs(right)
+    middle = (slice(down, rows - down), slice(aside, cols - aside))
+    start = (slice(0, rows - 2 * down), slice(aside - right, cols - aside - right))
+    end = (slice(2 * down, rows), slice(aside + right, cols - aside + right))
+    return start, middle, end
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contacts:
+    """Pairs of regions (first < second) that ways join, how many do, and their mean step and bend."""
+
+    first: Int64[np.ndarray, "n"]
+    second: Int64[np.ndarray, "n"]
+    count: Int64[np.ndarray, "n"]
+    step_m: Float64[np.ndarray, "n"]
+    bend_m: Float64[np.ndarray, "n"]
+
+
+def contacts(regions: Labels, along: list[Ways]) -> Contacts:
+    """The contacts of labelled regions; 0 is nobody. Noise averages out along a border, a true step does not."""
+    count = int(regions.max(initial=0)) + 1
+    keys, steps, bends = (np.concatenate(parts) for parts in zip(*_crossing(regions, along, count), strict=True))
+    pairs, place, number = np.unique(keys, return_inverse=True, return_counts=True)
+    step, bend = (np.bincount(place, weights=values, minlength=len(pairs)) / number for values in (steps, bends))
+    return Contacts(pairs // count, pairs % count, number.astype(np.int64), np.abs(step), bend)
+
+
+def _crossing(regions: Labels, along: list[Ways], count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each way from one region to another: the pair as one number, the step from the first, the bend."""
+    for way in along:
+        start, end = regions[way.start], regions[way.end]
+        place = np.flatnonzero(way.known & (start != end) & (start > 0) & (end > 0))
+        p, q = start.ravel()[place].astype(np.int64), end.ravel()[place].astype(np.int64)
+        step = way.step_m.ravel()[place]
+        yield np.minimum(p, q) * count + np.maximum(p, q), np.where(p < q, step, -step), way.bend_m.ravel()[place]
