@@ -8,21 +8,26 @@ from scipy import ndimage
 from binpick.data import Labels, Mask, Segments, frozen
 from binpick.scene import euclid, grid
 from binpick.scene.bin import FLOOR_M
-from binpick.scene.surface import Surface
+from binpick.scene.surface import Surface, around
 from binpick.settings import Bin, PartSize, SegmentSettings
 
 WALL_M = 0.003
 """Points this near a wall may be the wall."""
+LEAST_M = FLOOR_M / 2
+"""Nothing lower than this above the floor is of interest; nearer to it sigma decides."""
 METHODS = {"grid": grid.segment, "open3d": euclid.segment}
 
 
 def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSettings) -> Segments:
     """Faces and parts inside the bin and above its floor."""
     of_interest = _inside(surface, model)
-    faces, parts = METHODS[settings.method](surface, of_interest, settings)
-    spacing_m = grid.spacing(surface, of_interest)
+    box = around(of_interest)
+    near, asked = surface.cut(box), np.ascontiguousarray(of_interest[box])
+    found = METHODS[settings.method](near, asked, settings)
+    spacing_m = grid.spacing(near, asked)
     least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
-    faces, parts = _drop_small(faces, least), _drop_small(parts, least)
+    faces, parts = (np.zeros(of_interest.shape, dtype=np.int32) for _ in found)
+    faces[box], parts[box] = (_drop_small(labels, least) for labels in found)
     masks = {label: (box, parts[box] == label) for label, box in enumerate(ndimage.find_objects(parts), 1)}
     points = {label: surface.xyz[box][mask] for label, (box, mask) in masks.items()}
     return Segments(xyz=frozen(surface.xyz), normal=frozen(surface.normal), faces=frozen(faces), parts=frozen(parts),
@@ -35,18 +40,21 @@ def _inside(surface: Surface, model: Bin) -> Mask:
     length, width, _ = model.inner_size_m
     x, y, z = surface.xyz[..., 0], surface.xyz[..., 1], surface.xyz[..., 2]
     with np.errstate(invalid="ignore"):
-        above = z > np.maximum(np.float32(FLOOR_M / 2), 3 * surface.sigma_z_m)
+        above = z > np.maximum(np.float32(LEAST_M), 3 * surface.sigma_z_m)
         inside = (np.abs(x) < length / 2 - WALL_M) & (np.abs(y) < width / 2 - WALL_M)
     return np.asarray(above & inside & np.isfinite(surface.normal[..., 0]))
 
 
 def _drop_small(labels: Labels, least: int) -> Labels:
     """Only segments of at least `least` pixels, counted anew from 1 in reading order."""
-    sizes = np.bincount(labels.ravel())
-    keep = sizes >= least
-    keep[0] = False
+    sizes = np.bincount(labels.ravel(), minlength=1)
+    # the first pixel of each: written backwards, the first one is written last
+    first = np.zeros(len(sizes), dtype=np.int64)
+    first[labels.ravel()[::-1]] = np.arange(labels.size)[::-1]
+    keep = np.flatnonzero(sizes >= least)
+    keep = keep[keep > 0]
     renumbered = np.zeros(len(sizes), dtype=np.int32)
-    renumbered[keep] = np.arange(1, int(keep.sum()) + 1, dtype=np.int32)
+    renumbered[keep[np.argsort(first[keep])]] = np.arange(1, len(keep) + 1, dtype=np.int32)
     kept: Labels = renumbered[labels]
     return kept
 
