@@ -81,8 +81,7 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
     T_bin_camera = geometry.inverse(frames.T_camera_bin)
     with clock.stage("bin"):
         measured = float(depth.measured.mean())
-        box = load_carrier.search_box(job.bin, job.recipe.limits.above_rim_m)
-        grid = surface(depth, rectified, T_bin_camera, (box[0] + [0, 0, segmentation.LEAST_M], box[1]))
+        grid = surface(depth, rectified, T_bin_camera, segmentation.box(job.bin, job.recipe.limits.above_rim_m))
         heights = heightmap.height_map(grid.xyz, job.bin)
         filled = load_carrier.filling(heights, job.bin)
     seen = CycleResult(_answer(inputs, frames, clock, Code.NO_DEPTH, filled), rectified, depth, points)

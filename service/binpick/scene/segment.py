@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float32
 from scipy import ndimage
 
+from binpick import geometry
 from binpick.data import Labels, Mask, Segments, frozen
 from binpick.scene import euclid, grid
 from binpick.scene.bin import FLOOR_M
@@ -21,18 +22,25 @@ METHODS = {"grid": grid.segment, "open3d": euclid.segment}
 def segment(surface: Surface, model: Bin, part: PartSize, settings: SegmentSettings) -> Segments:
     """Faces and parts inside the bin and above its floor."""
     of_interest = _inside(surface, model)
-    box = around(of_interest)
-    near, asked = surface.cut(box), np.ascontiguousarray(of_interest[box])
+    inner = around(of_interest)
+    near, asked = surface.cut(inner), np.ascontiguousarray(of_interest[inner])
     found = METHODS[settings.method](near, asked, settings)
     spacing_m = grid.spacing(near, asked)
     least = max(12, int(0.5 * (part.min_size_m / spacing_m) ** 2)) if spacing_m else 12
     faces, parts = (np.zeros(of_interest.shape, dtype=np.int32) for _ in found)
-    faces[box], parts[box] = (_drop_small(labels, least) for labels in found)
+    faces[inner], parts[inner] = (_drop_small(labels, least) for labels in found)
     masks = {label: (box, parts[box] == label) for label, box in enumerate(ndimage.find_objects(parts), 1)}
     points = {label: surface.xyz[box][mask] for label, (box, mask) in masks.items()}
     return Segments(xyz=frozen(surface.xyz), normal=frozen(surface.normal), faces=frozen(faces), parts=frozen(parts),
                     part_points=points,
                     part_confidence={label: _confidence(points[label], mask, part) for label, (_, mask) in masks.items()})
+
+
+def box(model: Bin, above_rim_m: float) -> tuple[geometry.Vector, geometry.Vector]:
+    """The box in the bin's frame in which points can be of interest."""
+    length, width, height = model.inner_size_m
+    side = np.array([length / 2 - WALL_M, width / 2 - WALL_M])
+    return np.array([*-side, LEAST_M]), np.array([*side, height + above_rim_m])
 
 
 def _inside(surface: Surface, model: Bin) -> Mask:
