@@ -71,8 +71,8 @@ def clearance(grasp: Grasp, tool: Tool, scene: Obstacles) -> float:
 
 def _beneath(T_bin_tcp: Transform, tool: Tool, scene: Obstacles) -> Float64[np.ndarray, "n 3"]:
     """The solid's surface as points, tops and sides, in the rectangle of the bin's plane that the swept tool covers."""
-    reach = max(_extent(body)[0] for body in tool.bodies) + HORIZON_M
-    back = max(-_extent(body)[1] for body in tool.bodies) + tool.approach_m
+    reach = max(radius for radius, _, _ in _extents(tool)) + HORIZON_M
+    back = max(-low for _, low, _ in _extents(tool)) + tool.approach_m
     ends = np.stack([T_bin_tcp[:2, 3], T_bin_tcp[:2, 3] - back * T_bin_tcp[:2, 2]])
     origin = np.array([scene.origin_x_m, scene.origin_y_m])
     size = np.array(scene.height.shape[::-1])
@@ -94,6 +94,12 @@ def _backs(tool: Tool) -> Float64[np.ndarray, "s 3"]:
     return np.stack([np.zeros_like(steps), np.zeros_like(steps), -steps], axis=1)
 
 
+@functools.lru_cache(maxsize=16)
+def _extents(tool: Tool) -> tuple[tuple[float, float, float], ...]:
+    """Of every body its `_extent`."""
+    return tuple(_extent(body) for body in tool.bodies)
+
+
 def _extent(body: Body) -> tuple[float, float, float]:
     """Largest distance from the TCP's z axis, and lowest and highest z of its corners."""
     corners = geometry.transform(body.T_tcp_body.T_parent_this, _corners(body))
@@ -112,14 +118,14 @@ def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
 
 def _foot_radius_m(tool: Tool) -> float:
     """Radius of what comes down right above the lip."""
-    return max([tool.cups[0].radius_m] + [r for r, _, high in map(_extent, tool.bodies) if high > -0.01])
+    return max([tool.cups[0].radius_m] + [r for r, _, high in _extents(tool) if high > -0.01])
 
 
 def _near_bodies(points: Float64[np.ndarray, "n 3"], tool: Tool, sweep_m: float) -> Bool[np.ndarray, "n"]:
     """Points within HORIZON_M of some body's bounding cylinder about the TCP's axis, swept back by `sweep_m`."""
     radial = np.hypot(points[:, 0], points[:, 1])
     near = np.zeros(len(points), dtype=bool)
-    for radius, low, high in map(_extent, tool.bodies):
+    for radius, low, high in _extents(tool):
         near |= (radial < radius + HORIZON_M) & (points[:, 2] > low - HORIZON_M - sweep_m) & (points[:, 2] < high + HORIZON_M)
     return near
 

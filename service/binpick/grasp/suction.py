@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from binpick import geometry
 from binpick.data import Grasp, Labels, Segments
-from binpick.geometry import Transform
 from binpick.settings import Tool
 
 FIT_RADIUS = 1.1
@@ -64,11 +63,11 @@ def candidates(segments: Segments, tool: Tool, sigma_z_m: Float32[np.ndarray, "h
     seal = _seal(Patch(patch.local[on_one_part], patch.own[on_one_part], patch.stride), cup.radius_m)
     limit_m = SEAL_SHARE * tool.compliance_m
     sealed = (np.maximum(seal.deviation_m, seal.bend_m) <= limit_m) & (seal.stand_out_m <= STAND_OUT_M)
-    upright = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1)) <= tool.max_tilt_rad
+    normal = seal.normal_bin(T_bin_spot)
+    upright = np.arccos(np.clip(normal[:, 2], -1, 1)) <= tool.max_tilt_rad
     reasons |= {"no_seal": int((~sealed).sum()), "tilt": int((sealed & ~upright).sum())}
-    long_axes = _long_axes(segments)
-    grasps = [_grasp(i, segments, spots, seal, T_bin_spot, long_axes, tool, sigma_z_m)
-              for i in np.flatnonzero(sealed & upright).tolist()]
+    chosen = np.flatnonzero(sealed & upright)
+    grasps = _grasps(chosen, segments, spots[chosen], seal, normal[chosen], T_bin_spot[chosen], tool, sigma_z_m)
     reasons["sealed"] = len(grasps)
     return grasps, reasons
 
@@ -259,28 +258,30 @@ def _quantile(values: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"], s
     return picked
 
 
-def _long_axes(segments: Segments) -> dict[int, geometry.Vector]:
-    """The direction of the longest extent of every part, bin frame, sign fixed (first non-zero component positive)."""
-    axes = {}
-    for label, points in segments.part_points.items():
-        _, vectors = np.linalg.eigh(np.cov(points.T.astype(np.float64)))
-        axis = vectors[:, 2]
-        axes[label] = axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
-    return axes
+def _long_axis(points: Float32[np.ndarray, "n 3"]) -> geometry.Vector:
+    """The direction of the longest extent of a part, bin frame, sign fixed (first non-zero component positive)."""
+    some = points[::max(1, len(points) // 400)].astype(np.float64)
+    x, y, z = (some - some.mean(axis=0)).T
+    # sums of products by numpy itself: BLAS would wake threads for so little
+    xx, yy, zz, xy, xz, yz = ((a * b).sum() for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    _, vectors = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    axis: geometry.Vector = vectors[:, 2]
+    return axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
 
 
-def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal, T_bin_spot: Float64[np.ndarray, "n 4 4"],
-           long_axes: dict[int, geometry.Vector], tool: Tool, sigma_z_m: Float32[np.ndarray, "h w"]) -> Grasp:
-    row, col = int(spots[i, 0]), int(spots[i, 1])
-    part = int(segments.parts[row, col])
-    normal = seal.normal_bin(T_bin_spot)[i]
+def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal,
+            normal: Float64[np.ndarray, "n 3"], T_bin_spot: Float64[np.ndarray, "n 4 4"], tool: Tool,
+            sigma_z_m: Float32[np.ndarray, "h w"]) -> list[Grasp]:
+    """The chosen spots as grasps; all but the seal holds the chosen only."""
+    part = segments.parts[spots[:, 0], spots[:, 1]]
+    axes = {label: _long_axis(segments.part_points[label]) for label in np.unique(part).tolist()}
     # on a curved part the lip's middle lies on the surface, not on the plane through its rim
-    point_local = np.array([0.0, 0.0, seal.level_m[i] + seal.centre_m[i]])
-    T_bin_tcp: Transform = geometry.frame_of_axes(-normal, long_axes[part], geometry.transform(T_bin_spot[i], point_local))
-    sigma_px_m = float(sigma_z_m[row, col])
-    independent = max(1.0, float(seal.support[i]) / CORRELATED_PX)
+    origin = T_bin_spot[:, :3, 3] + T_bin_spot[:, :3, 2] * (seal.level_m + seal.centre_m)[chosen, None]
+    sigma_px_m = sigma_z_m[spots[:, 0], spots[:, 1]].astype(np.float64)
+    sigma_m = sigma_px_m / np.sqrt(np.maximum(1.0, seal.support[chosen] / CORRELATED_PX))
     radius_m = tool.cups[0].radius_m
-    return Grasp(T_bin_tcp=T_bin_tcp, tool=tool.number, part_id=part, open_m=0.0, close_m=0.0, quality=0.0,
-                 seal_m=float(seal.bend_m[i]), room=float(seal.room[i]), sigma_xy_m=sigma_px_m / 2,
-                 sigma_z_m=float(sigma_px_m / np.sqrt(independent)),
-                 sigma_tilt_rad=float(2 * sigma_px_m / radius_m / np.sqrt(independent)))
+    return [
+        Grasp(T_bin_tcp=geometry.frame_of_axes(-normal[n], axes[label], origin[n]), tool=tool.number, part_id=label, open_m=0.0,
+              close_m=0.0, quality=0.0, seal_m=float(seal.bend_m[i]), room=float(seal.room[i]),
+              sigma_xy_m=float(sigma_px_m[n] / 2), sigma_z_m=float(sigma_m[n]), sigma_tilt_rad=float(2 * sigma_m[n] / radius_m))
+        for n, (i, label) in enumerate(zip(chosen.tolist(), part.tolist(), strict=True))]

@@ -1,6 +1,6 @@
 """Segmentation against the truth: which of the parts in plain view come out as one segment of their own."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,12 +41,12 @@ def score(paper: Paper, truth: Truth, view: Window, parts: Labels) -> list[PartS
 
 
 def recall(scores: Iterable[PartScore], iou: float = HALF, least: float = PLAIN_VIEW, most: float = 1.0) -> tuple[int, int]:
-    """How many of the parts seen from `least` to `most` were found at an intersection over union above `iou`, and of how many."""
+    """How many parts seen from `least` to `most` have an intersection over union above `iou`, and of how many."""
     asked = [s for s in scores if least <= s.visibility <= most]
     return sum(s.iou > iou for s in asked), len(asked)
 
 
-def overlaps(parts: Labels, part_id: Int32[np.ndarray, "h w"]) -> dict[int, tuple[float, float]]:
+def overlaps(parts: Labels, part_id: Int32[np.ndarray, "h2 w2"]) -> dict[int, tuple[float, float]]:
     """For each true part the best segment's intersection over union, counted in full pixels, and that segment's purity.
 
     `parts` is the half-resolution label map (0: nobody) of `part_id`'s window; an odd last row or column belongs to nobody.

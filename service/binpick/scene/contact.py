@@ -1,13 +1,16 @@
 """How the surface goes on across a short way: in steps and in bends, and how regions that touch do so along their border.
 
 Two points a few millimetres apart lie above or below each other's tangent planes. Where one surface goes on both are zero; at a
-fold both points lie on the same side, at a step on opposite sides. This holds whatever lies between the two, so a border that is
-measured a pixel off, or as a ramp, does not hide what it separates.
+fold both points lie on the same side, at a step on opposite sides. This holds whatever lies between the two, so a border that
+is measured a pixel off, or as a ramp, does not hide what it separates.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
@@ -19,6 +22,7 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 Grid = tuple[slice, slice]
 Field = Float32[np.ndarray, "h w"]
+Planes = Float32[np.ndarray, "3 h w"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,18 +45,22 @@ class Ways:
 def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
     """The ways of all directions, `half_px` pixels to either side of their middle."""
     xyz, normal = (np.ascontiguousarray(field.transpose(2, 0, 1)) for field in (surface.xyz, surface.normal))
-    found = []
-    for down, right in DIRECTIONS:
-        far = half_px if not down * right else max(1, round(half_px / 2**0.5))
-        start, middle, end = _grids(down * far, right * far, of_interest.shape)
-        above = below = np.float32(0)
-        for axis in range(3):
-            step = xyz[axis][end] - xyz[axis][start]
-            above, below = above + normal[axis][start] * step, below - normal[axis][end] * step
-        half = np.float32(0.5)
-        found.append(Ways(start, middle, end, of_interest[start] & of_interest[end], (above - below) * half,
-                          (above + below) * half, np.minimum(surface.sigma_z_m[start], surface.sigma_z_m[end])))
-    return found
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-ways") as pool:
+        return list(pool.map(partial(_ways, xyz, normal, surface.sigma_z_m, of_interest, half_px), DIRECTIONS))
+
+
+def _ways(xyz: Planes, normal: Planes, sigma_z_m: Field, of_interest: Mask, half_px: int, direction: tuple[int, int]) -> Ways:
+    down, right = (sign * (half_px if not all(direction) else max(1, round(half_px / 2**0.5))) for sign in direction)
+    start, middle, end = _grids(down, right, of_interest.shape)
+    above = np.zeros(of_interest[start].shape, dtype=np.float32)
+    below = above.copy()
+    for plane, slope in zip(xyz, normal, strict=True):
+        step = plane[end] - plane[start]
+        above += slope[start] * step
+        below -= slope[end] * step
+    half = np.float32(0.5)
+    return Ways(start, middle, end, of_interest[start] & of_interest[end], (above - below) * half, (above + below) * half,
+                np.minimum(sigma_z_m[start], sigma_z_m[end]))
 
 
 def _grids(down: int, right: int, shape: tuple[int, ...]) -> tuple[Grid, Grid, Grid]:

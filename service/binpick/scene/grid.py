@@ -1,8 +1,9 @@
 """Parts on the pixel grid: regions between steps and creases, joined where along their whole border one surface goes on.
 
-The idea is that of locally convex connected patches (Stein et al., LCCP, 2014) on the organised grid: a concave crease separates
-two parts, a convex one two faces of one part. A single link decides nothing, as one leak would merge two parts: regions are
-what hangs together even when its border is taken off, and whether two belong together is asked of all ways across their border.
+The idea is that of locally convex connected patches (Stein et al., LCCP, 2014) on the organised grid: a concave crease
+separates two parts, a convex one two faces of one part. A single link decides nothing, as one leak would merge two parts:
+regions are what hangs together even when its border is taken off, and whether two belong together is asked of all ways across
+their border.
 """
 
 import cv2

@@ -85,14 +85,12 @@ def _half(depth: Depth) -> tuple[Field, Field]:
 
 
 def _planes(disparity: Field, wanted: Mask) -> tuple[Int64[np.ndarray, "n"], Values, Values, Values]:
-    """Pixels (in reading order) among those wanted whose best plane has support: its slopes per half-resolution px, its level."""
-    rows, cols = disparity.shape
+    """Those wanted pixels, in reading order, whose best plane has support: its slopes per half-resolution px and its level."""
+    cols = disparity.shape[1]
     box = around(wanted, 2 * RADIUS)
     near = np.ascontiguousarray(disparity[box])
-    if not near.size:
-        return np.zeros(0, dtype=np.int64), *(np.zeros(0, dtype=np.float32) for _ in range(3))
     slope_u, slope_v, level, misfit = (field.ravel() for field in _fits(near, np.isfinite(near)))
-    height, width = near.shape
+    width = near.shape[1]
     row, col = np.nonzero(wanted[box])
     # what the windows reach beyond the window's border has no support
     framed = np.pad(misfit.reshape(near.shape), RADIUS, constant_values=np.inf).ravel()
@@ -113,12 +111,13 @@ def _planes(disparity: Field, wanted: Mask) -> tuple[Int64[np.ndarray, "n"], Val
 
 
 def around(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
-    """The smallest box that holds a mask, with a margin as far as there are pixels; empty when the mask is."""
+    """The smallest box that holds a mask, with a margin as far as there are pixels; the first pixel if it is empty."""
     rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
-        return slice(0, 0), slice(0, 0)
-    top, left = max(0, int(rows[0]) - margin), max(0, int(cols[0]) - margin)
-    return slice(top, min(mask.shape[0], int(rows[-1]) + 1 + margin)), slice(left, min(mask.shape[1], int(cols[-1]) + 1 + margin))
+        return slice(0, 1), slice(0, 1)
+    high, wide = (slice(max(0, int(side[0]) - margin), min(count, int(side[-1]) + 1 + margin))
+                  for side, count in zip((rows, cols), mask.shape, strict=True))
+    return high, wide
 
 
 def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
