@@ -22,7 +22,7 @@ SECTORS = 16
 """The lip is judged in this many sectors; each must show the part."""
 POINTS_PER_RADIUS = 6
 """Neighbourhoods are looked at with about this many points along the lip's radius, if there are as many."""
-PEAK_M = 0.003
+PEAK_M = 0.004
 """Of the spots in a square of this side one is tried."""
 LEAST_INSIDE = 0.65
 """Spots nearer to their segment's border than this share of the lip's radius are not tried; tilt shortens distances."""
@@ -123,6 +123,8 @@ def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: floa
     reach = int(np.ceil(SKIRT_RADIUS * 1.3 * radius_m / max(spacing_m, 1e-4) / stride))
     steps = stride * np.arange(-reach, reach + 1)
     i, j = (side.ravel() for side in np.meshgrid(steps, steps, indexing="ij"))
+    disc = np.hypot(i, j) <= reach * stride
+    i, j = i[disc], j[disc]
     place = np.clip(spots[:, :1] + i, 0, rows - 1) * cols + np.clip(spots[:, 1:] + j, 0, cols - 1)
     at = spots[:, 0] * cols + spots[:, 1]
     xyz, normals, parts = segments.xyz.reshape(-1, 3), segments.normal.reshape(-1, 3), segments.parts.ravel()

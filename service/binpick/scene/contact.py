@@ -23,6 +23,8 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 Grid = tuple[slice, slice]
 Field = Float32[np.ndarray, "h w"]
 Planes = Float32[np.ndarray, "3 h w"]
+Integers = Int64[np.ndarray, "n"]
+Values = Float64[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,29 +77,41 @@ def _grids(down: int, right: int, shape: tuple[int, ...]) -> tuple[Grid, Grid, G
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contacts:
-    """Pairs of regions (first < second) that ways join, how many do, and their mean step and bend."""
+    """Pairs of regions (first < second) that ways join, how many do, and their mean step (up from the first) and bend."""
 
     first: Int64[np.ndarray, "n"]
     second: Int64[np.ndarray, "n"]
-    count: Int64[np.ndarray, "n"]
+    count: Float64[np.ndarray, "n"]
     step_m: Float64[np.ndarray, "n"]
     bend_m: Float64[np.ndarray, "n"]
+
+    @classmethod
+    def of(cls, start: Integers, end: Integers, count: Values, step_m: Values, bend_m: Values) -> "Contacts":
+        """Pairs that occur several times, in either order, as one; what joins a region to itself is left out."""
+        apart = start != end
+        start, end, count, step_m, bend_m = (values[apart] for values in (start, end, count, step_m, bend_m))
+        regions = int(max(start.max(initial=0), end.max(initial=0))) + 1
+        pairs, place = np.unique(np.minimum(start, end) * regions + np.maximum(start, end), return_inverse=True)
+        sums = (count, np.where(start < end, step_m, -step_m) * count, bend_m * count)
+        number, step, bend = (np.bincount(place, weights=values, minlength=len(pairs)) for values in sums)
+        return cls(pairs // regions, pairs % regions, number, step / number, bend / number)
+
+    def merged(self, group: Integers) -> "Contacts":
+        """The contacts of the groups that the regions fall into."""
+        return Contacts.of(group[self.first], group[self.second], self.count, self.step_m, self.bend_m)
 
 
 def contacts(regions: Labels, along: list[Ways]) -> Contacts:
     """The contacts of labelled regions; 0 is nobody. Noise averages out along a border, a true step does not."""
-    count = int(regions.max(initial=0)) + 1
-    keys, steps, bends = (np.concatenate(parts) for parts in zip(*_crossing(regions, along, count), strict=True))
-    pairs, place, number = np.unique(keys, return_inverse=True, return_counts=True)
-    step, bend = (np.bincount(place, weights=values, minlength=len(pairs)) / number for values in (steps, bends))
-    return Contacts(pairs // count, pairs % count, number.astype(np.int64), np.abs(step), bend)
+    start, end, step, bend = (np.concatenate(parts) for parts in zip(*_crossing(regions, along), strict=True))
+    return Contacts.of(start, end, np.ones(len(start)), step, bend)
 
 
-def _crossing(regions: Labels, along: list[Ways], count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each way from one region to another: the pair as one number, the step from the first, the bend."""
+def _crossing(regions: Labels, along: list[Ways]) -> Iterator[tuple[Integers, Integers, Values, Values]]:
+    """Of each way from one region to another: where it starts, where it ends, the step and the bend."""
     for way in along:
         start, end = regions[way.start], regions[way.end]
         place = np.flatnonzero(way.known & (start != end) & (start > 0) & (end > 0))
-        p, q = start.ravel()[place].astype(np.int64), end.ravel()[place].astype(np.int64)
-        step = way.step_m.ravel()[place]
-        yield np.minimum(p, q) * count + np.maximum(p, q), np.where(p < q, step, -step), way.bend_m.ravel()[place]
+        p, q = (labels.ravel()[place].astype(np.int64) for labels in (start, end))
+        step, bend = (field.ravel()[place].astype(np.float64) for field in (way.step_m, way.bend_m))
+        yield p, q, step, bend

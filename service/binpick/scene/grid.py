@@ -8,7 +8,7 @@ their border.
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy import sparse
 from scipy.sparse import csgraph
 
@@ -115,29 +115,25 @@ def _grown(cores: Labels, surface: Surface, of_interest: Mask, reach_px: float) 
 
 
 def _joined(regions: Labels, along: list[Ways], spacing_m: float) -> Labels:
-    """Regions joined to parts."""
-    touching = contacts(regions, along)
-    size, border = _sizes(regions, touching, spacing_m)
-    big = size > BIG_M2
-    same = (touching.step_m < np.where(big, BIG_STEP_M, STEP_M)) & (touching.bend_m < np.where(big, BIG_BEND_M, BEND_M))
-    same &= border >= np.where(big, BIG_BORDER_M, BORDER_M)
-    parts = _merged(regions, touching.first[same], touching.second[same])
-    touching = contacts(parts, along)
-    size, _ = _sizes(parts, touching, spacing_m)
-    likely = (size < FRAGMENT_M2) & (touching.step_m < FRAGMENT_STEP_M) & (touching.bend_m < FRAGMENT_BEND_M)
-    return _merged(parts, *_best(parts, touching, likely))
+    """Regions joined to parts; 0 stays nobody."""
+    touching, area = contacts(regions, along), np.bincount(regions.ravel()) * spacing_m**2
+    big = np.minimum(area[touching.first], area[touching.second]) > BIG_M2
+    same = np.abs(touching.step_m) < np.where(big, BIG_STEP_M, STEP_M)
+    same &= touching.bend_m < np.where(big, BIG_BEND_M, BEND_M)
+    # each pixel along a border is crossed by about four ways
+    same &= touching.count * spacing_m / 4 >= np.where(big, BIG_BORDER_M, BORDER_M)
+    group = _groups(len(area), touching.first[same], touching.second[same])
+    touching, area = touching.merged(group), np.bincount(group, weights=area)
+    likely = np.minimum(area[touching.first], area[touching.second]) < FRAGMENT_M2
+    likely &= (np.abs(touching.step_m) < FRAGMENT_STEP_M) & (touching.bend_m < FRAGMENT_BEND_M)
+    fragments = _groups(len(area), *_best(area, touching, likely))
+    parts: Labels = fragments[group].astype(np.int32)[regions]
+    return parts
 
 
-def _sizes(regions: Labels, touching: Contacts, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of each contact the smaller region's area, square metres, and about how long the border is, metres."""
-    area = np.bincount(regions.ravel()) * spacing_m**2
-    return np.minimum(area[touching.first], area[touching.second]), touching.count * spacing_m / 4
-
-
-def _best(parts: Labels, touching: Contacts, likely: Bool[np.ndarray, "n"],
+def _best(area: Float64[np.ndarray, "p"], touching: Contacts, likely: Bool[np.ndarray, "n"],
           ) -> tuple[Int64[np.ndarray, "m"], Int64[np.ndarray, "m"]]:
     """For the smaller region of every likely contact the one it shares most border with."""
-    area = np.bincount(parts.ravel())
     first, second, count = touching.first[likely], touching.second[likely], touching.count[likely]
     swap = area[second] < area[first]
     small, large = np.where(swap, second, first), np.where(swap, first, second)
@@ -146,15 +142,12 @@ def _best(parts: Labels, touching: Contacts, likely: Bool[np.ndarray, "n"],
     return small[order][best], large[order][best]
 
 
-def _merged(regions: Labels, first: Int64[np.ndarray, "n"], second: Int64[np.ndarray, "n"]) -> Labels:
-    """Regions with pairs of them made one; 0 stays nobody."""
-    count = int(regions.max(initial=0)) + 1
+def _groups(count: int, first: Int64[np.ndarray, "n"], second: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "c"]:
+    """The group of each of `count` regions when pairs of them are made one; 0, which no pair may hold, stays 0."""
     graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
     _, group = csgraph.connected_components(graph, directed=False)
-    group = group.astype(np.int32) + 1
-    group[0] = 0
-    merged: Labels = group[regions]
-    return merged
+    # nobody is region 0, a component of its own and the first
+    return np.asarray(group, dtype=np.int64)
 
 
 def _faces(parts: Labels, creases: Mask) -> Labels:
