@@ -129,7 +129,8 @@ def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: floa
     at = spots[:, 0] * cols + spots[:, 1]
     xyz, normals, parts = segments.xyz.reshape(-1, 3), segments.normal.reshape(-1, 3), segments.parts.ravel()
     origin, normal = xyz[at].astype(np.float64), normals[at].astype(np.float64)
-    T_bin_spot = _frames(normal, origin)
+    along = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    T_bin_spot = _frames(normal, along, origin)
     offset = xyz.take(place, axis=0) - origin[:, None].astype(np.float32)
     local = np.matmul(offset, T_bin_spot[:, :3, :3].astype(np.float32))
     return Patch(local=local, own=parts.take(place) == parts[at][:, None], stride=stride), T_bin_spot
@@ -153,11 +154,13 @@ def _centred(patch: Patch, T_bin_spot: Float64[np.ndarray, "n 4 4"], radius_m: f
     return Patch(local=local, own=patch.own, stride=patch.stride), moved
 
 
-def _frames(normal: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4 4"]:
-    """Frames with z along the normals; x lies in the plane of z and the bin's x, or y where those are parallel."""
-    z = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    hint = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+def _frames(z: Float64[np.ndarray, "n 3"], hint: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "n 3"],
+            ) -> Float64[np.ndarray, "n 4 4"]:
+    """Frames with z along the given directions and x the part of the hint square to it, as `geometry.frame_of_axes`."""
+    z = z / np.linalg.norm(z, axis=1, keepdims=True)
     x = hint - (hint * z).sum(axis=1, keepdims=True) * z
+    parallel = np.linalg.norm(x, axis=1) < 1e-9
+    x[parallel] = np.cross(z[parallel], np.eye(3)[np.abs(z[parallel]).argmin(axis=1)])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     frames = np.tile(np.eye(4), (len(z), 1, 1))
     frames[:, :3, 0], frames[:, :3, 1], frames[:, :3, 2], frames[:, :3, 3] = x, np.cross(z, x), z, origin
@@ -276,14 +279,16 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, spots: Int32[np.
             sigma_z_m: Float32[np.ndarray, "h w"]) -> list[Grasp]:
     """The chosen spots as grasps; all but the seal holds the chosen only."""
     part = segments.parts[spots[:, 0], spots[:, 1]]
-    axes = {label: _long_axis(segments.part_points[label]) for label in np.unique(part).tolist()}
+    labels, whose = np.unique(part, return_inverse=True)
+    axes = np.array([_long_axis(segments.part_points[label]) for label in labels.tolist()]).reshape(-1, 3)
     # on a curved part the lip's middle lies on the surface, not on the plane through its rim
     origin = T_bin_spot[:, :3, 3] + T_bin_spot[:, :3, 2] * (seal.level_m + seal.centre_m)[chosen, None]
+    T_bin_tcp = _frames(-normal, axes[whose], origin)
     sigma_px_m = sigma_z_m[spots[:, 0], spots[:, 1]].astype(np.float64)
     sigma_m = sigma_px_m / np.sqrt(np.maximum(1.0, seal.support[chosen] / CORRELATED_PX))
     radius_m = tool.cups[0].radius_m
     return [
-        Grasp(T_bin_tcp=geometry.frame_of_axes(-normal[n], axes[label], origin[n]), tool=tool.number, part_id=label, open_m=0.0,
-              close_m=0.0, quality=0.0, seal_m=float(seal.bend_m[i]), room=float(seal.room[i]),
-              sigma_xy_m=float(sigma_px_m[n] / 2), sigma_z_m=float(sigma_m[n]), sigma_tilt_rad=float(2 * sigma_m[n] / radius_m))
+        Grasp(T_bin_tcp=T_bin_tcp[n], tool=tool.number, part_id=label, open_m=0.0, close_m=0.0, quality=0.0,
+              seal_m=float(seal.bend_m[i]), room=float(seal.room[i]), sigma_xy_m=float(sigma_px_m[n] / 2),
+              sigma_z_m=float(sigma_m[n]), sigma_tilt_rad=float(2 * sigma_m[n] / radius_m))
         for n, (i, label) in enumerate(zip(chosen.tolist(), part.tolist(), strict=True))]

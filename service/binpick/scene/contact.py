@@ -93,7 +93,8 @@ class Contacts:
         regions = int(max(start.max(initial=0), end.max(initial=0))) + 1
         pairs, place = np.unique(np.minimum(start, end) * regions + np.maximum(start, end), return_inverse=True)
         sums = (count, np.where(start < end, step_m, -step_m) * count, bend_m * count)
-        number, step, bend = (np.bincount(place, weights=values, minlength=len(pairs)) for values in sums)
+        # of nothing at all bincount makes integers
+        number, step, bend = (np.bincount(place, values, len(pairs)).astype(np.float64) for values in sums)
         return cls(pairs // regions, pairs % regions, number, step / number, bend / number)
 
     def merged(self, group: Integers) -> "Contacts":

@@ -116,14 +116,15 @@ def _grown(cores: Labels, surface: Surface, of_interest: Mask, reach_px: float) 
 
 def _joined(regions: Labels, along: list[Ways], spacing_m: float) -> Labels:
     """Regions joined to parts; 0 stays nobody."""
-    touching, area = contacts(regions, along), np.bincount(regions.ravel()) * spacing_m**2
+    touching = contacts(regions, along)
+    area: Float64[np.ndarray, "p"] = np.bincount(regions.ravel()) * spacing_m**2
     big = np.minimum(area[touching.first], area[touching.second]) > BIG_M2
     same = np.abs(touching.step_m) < np.where(big, BIG_STEP_M, STEP_M)
     same &= touching.bend_m < np.where(big, BIG_BEND_M, BEND_M)
     # each pixel along a border is crossed by about four ways
     same &= touching.count * spacing_m / 4 >= np.where(big, BIG_BORDER_M, BORDER_M)
     group = _groups(len(area), touching.first[same], touching.second[same])
-    touching, area = touching.merged(group), np.bincount(group, weights=area)
+    touching, area = touching.merged(group), np.bincount(group, weights=area).astype(np.float64)
     likely = np.minimum(area[touching.first], area[touching.second]) < FRAGMENT_M2
     likely &= (np.abs(touching.step_m) < FRAGMENT_STEP_M) & (touching.bend_m < FRAGMENT_BEND_M)
     fragments = _groups(len(area), *_best(area, touching, likely))
