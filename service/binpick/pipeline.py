@@ -88,7 +88,8 @@ def _scene(inputs: CycleInput, frames: "_Frames", clock: "_Clock", rectified: Re
         if frames.location is not None and frames.location.fault is not None:
             return CycleResult(_answer(inputs, frames, clock, frames.location.fault), rectified, depth, points)
     with clock.stage("bin"):
-        grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin))
+        grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin),
+                       segmentation.box(job.bin, job.recipe.limits.above_rim_m))
         heights = heightmap.height_map(grid.xyz, job.bin)
         filled = load_carrier.filling(heights, job.bin, job.recipe.part)
     seen = CycleResult(_answer(inputs, frames, clock, Code.NO_DEPTH, filled), rectified, depth, points)

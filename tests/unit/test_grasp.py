@@ -144,3 +144,12 @@ def test_a_grasp_is_a_value(plant, slab):
     *_, grasps, _ = found(planted)
     assert replace(grasps[0], quality=0.5).quality == 0.5
     assert grasps[0].quality == 0.0
+
+
+@pytest.mark.parametrize("aside_m", [-0.0006, 0.0, 0.0006])
+def test_a_lip_sits_in_the_middle_of_a_narrow_face(plant, slab, aside_m):
+    # half a millimetre is left on either side of the lip; a half-resolution pixel is 1.1 mm
+    planted = plant([slab(0.0, aside_m, 0.06, 0.015, 0.05)], noise_px=0.05)
+    _, segments, grasps, _ = found(planted)
+    best = rank.rank(grasps, segments, planted.job.tool)[0]
+    assert abs(best.T_bin_tcp[1, 3] - aside_m) < 0.0004

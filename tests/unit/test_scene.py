@@ -1,5 +1,6 @@
 """Planted boxes: the scene stages find what was put there, and nothing else."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -102,3 +103,73 @@ def test_a_bin_in_the_base_needs_a_hand_eye(job):
         load_carrier.place(in_base, None)
     T_base_camera = geometry.translation(1.0, 2.0, 3.0)
     assert np.allclose(load_carrier.place(in_base, T_base_camera), geometry.inverse(T_base_camera) @ in_base.T_parent_bin)
+
+
+def labels_at(segments, *points):
+    """The parts around places of the bin, whose surface stands wherever it does."""
+    found = []
+    for x, y in points:
+        here = np.hypot(segments.xyz[..., 0] - x, segments.xyz[..., 1] - y) < 0.004
+        labels = np.unique(segments.parts[here])
+        assert len(labels[labels > 0]) == 1
+        found.append(int(labels[-1]))
+    return found
+
+
+def test_a_thin_plate_on_a_plate_is_a_part(plant, slab):
+    segments = segmented(plant([slab(0, 0, 0.12, 0.08, 0.03), slab(0.03, 0, 0.06, 0.08, 0.033)], noise_px=0.07))
+    left, right = labels_at(segments, (-0.03, 0), (0.03, 0))
+    assert left != right
+
+
+def test_a_concave_crease_separates_two_parts_and_a_convex_one_two_faces(plant, slab):
+    # tops tilted towards or from each other that meet at y = 0
+    def faces_meeting(tilt):
+        rise = 0.02 * np.tan(abs(tilt))
+        top = 0.04 + rise if tilt > 0 else 0.04
+        return [slab(0, -0.02, 0.06, 0.04, top, -tilt), slab(0, 0.02, 0.06, 0.04, top, tilt)]
+
+    valley = segmented(plant(faces_meeting(0.35), noise_px=0.07))
+    one, other = labels_at(valley, (0, -0.02), (0, 0.02))
+    assert one != other
+    roof = segmented(plant(faces_meeting(-0.35), noise_px=0.07))
+    one, other = labels_at(roof, (0, -0.02), (0, 0.02))
+    assert one == other
+    faces = [np.unique(roof.faces[np.hypot(roof.xyz[..., 0], roof.xyz[..., 1] - y) < 0.004]) for y in (-0.02, 0.02)]
+    assert faces[0][-1] != faces[1][-1]
+
+
+def test_a_leak_does_not_join_two_parts(plant, slab):
+    # two plates of one height, 3 mm apart, bridged by a strip as wide as two pixels
+    plates = [slab(-0.0415, 0, 0.08, 0.06, 0.03), slab(0.0415, 0, 0.08, 0.06, 0.03), slab(0, 0, 0.006, 0.0025, 0.03)]
+    left, right = labels_at(segmented(plant(plates, noise_px=0.05)), (-0.04, 0), (0.04, 0))
+    assert left != right
+
+
+@pytest.mark.parametrize("method", ["grid", "open3d"])
+def test_segments_do_not_depend_on_the_number_of_threads(plant, slab, method):
+    boxes = [slab(-0.08, 0, 0.05, 0.04, 0.03), slab(-0.05, 0.02, 0.05, 0.04, 0.045, 0.2), slab(0.08, 0, 0.05, 0.04, 0.015)]
+    planted = plant(boxes, noise_px=0.15)
+    threads, found = cv2.getNumThreads(), []
+    try:
+        for number in (1, 2):
+            cv2.setNumThreads(number)
+            segments = segmented(planted, method)
+            found.append((segments.normal.tobytes(), segments.faces.tobytes(), segments.parts.tobytes(),
+                          segments.part_confidence))
+    finally:
+        cv2.setNumThreads(threads)
+    assert found[0] == found[1]
+
+
+def test_what_lies_below_others_is_less_sure_to_be_one_part(plant, slab):
+    alone = segmented(plant([slab(0, 0, 0.08, 0.04, 0.02)]))
+    below = segmented(plant([slab(0, 0, 0.08, 0.04, 0.02), slab(0, 0.03, 0.10, 0.02, 0.05), slab(0, -0.03, 0.10, 0.02, 0.05)]))
+    (sure,), (middle,) = labels_at(alone, (0, 0)), labels_at(below, (0, 0))
+    assert below.part_confidence[middle] < 0.85 * alone.part_confidence[sure]
+
+
+def test_an_empty_bin_has_no_segments(plant):
+    segments = segmented(plant([]))
+    assert not segments.part_confidence
+    assert not segments.parts.any()

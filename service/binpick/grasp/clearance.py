@@ -120,6 +120,12 @@ def _backs(tool: Tool) -> Float64[np.ndarray, "s 3"]:
     return np.stack([np.zeros_like(steps), np.zeros_like(steps), -steps], axis=1)
 
 
+@functools.lru_cache(maxsize=16)
+def _extents(tool: Tool) -> tuple[tuple[float, float, float], ...]:
+    """Of every body its `_extent`."""
+    return tuple(_extent(body) for body in tool.bodies)
+
+
 def _extent(body: Body) -> tuple[float, float, float]:
     """Largest distance from the TCP's z axis, and lowest and highest z of its corners."""
     corners = _placed(body)[1]
@@ -145,7 +151,7 @@ def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
 
 def _foot_radius_m(tool: SuctionTool) -> float:
     """Radius of what comes down right above the lip."""
-    return max([tool.cups[0].radius_m] + [r for r, _, high in map(_extent, tool.bodies) if high > -0.01])
+    return max([tool.cups[0].radius_m] + [r for r, _, high in _extents(tool) if high > -0.01])
 
 
 def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float) -> float:

@@ -1,5 +1,6 @@
 """The order of grasps: named terms, quantised and stable, so that the same scene gives the same bytes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -29,24 +30,26 @@ def rank(grasps: list[Grasp], segments: Segments, *tools: Tool) -> list[Grasp]:
 
 def ordered(grasps: list[Grasp], segments: Segments, *tools: Tool) -> list[Grasp]:
     """Best first, with qualities."""
+    if not grasps:
+        return []
     by_number = {tool.number: tool for tool in tools}
-    area_px = {label: len(points) for label, points in segments.part_points.items()}
-    centre = {label: points.mean(axis=0) for label, points in segments.part_points.items()}
-    largest = max(area_px.values(), default=1)
-    top = max((float(g.T_bin_tcp[2, 3]) for g in grasps), default=0.0)
+    T_bin_tcp = np.stack([grasp.T_bin_tcp for grasp in grasps])
+    centre = {label: segments.part_points[label].mean(axis=0) for label in {grasp.part_id for grasp in grasps}}
+    largest = max(len(points) for points in segments.part_points.values())
+    top = max(float(T_bin_tcp[:, 2, 3].max()), 1e-3)
+    tilts = np.arccos(np.clip(-T_bin_tcp[:, 2, 2], -1, 1)).tolist()
+    offsets = np.linalg.norm(T_bin_tcp[:, :3, 3] - [centre[grasp.part_id] for grasp in grasps], axis=1).tolist()
     scored = []
-    for grasp in grasps:
+    for grasp, height, tilt, offset in zip(grasps, T_bin_tcp[:, 2, 3].tolist(), tilts, offsets, strict=True):
         tool = by_number[grasp.tool]
-        offset = float(np.linalg.norm(grasp.T_bin_tcp[:3, 3] - centre[grasp.part_id]))
-        tilt = float(np.arccos(np.clip(-grasp.T_bin_tcp[2, 2], -1, 1)))
         terms = {
-            "height": float(np.clip(grasp.T_bin_tcp[2, 3] / max(top, 1e-3), 0, 1)),
-            "area": float(np.sqrt(area_px[grasp.part_id] / largest)),
+            "height": min(max(height / top, 0.0), 1.0),
+            "area": float(np.sqrt(len(segments.part_points[grasp.part_id]) / largest)),
             "upright": 1 - tilt / max(tool.max_tilt_rad, 1e-6) if tool.max_tilt_rad else 1.0,
-            "centre": float(np.clip(1 - offset / 0.03, 0, 1)),
+            "centre": max(1 - offset / 0.03, 0.0),
         }
         quality = segments.part_confidence[grasp.part_id] * sum(WEIGHTS[name] * value for name, value in terms.items())
-        scored.append(replace(grasp, quality=round(float(np.clip(quality * _hold(grasp, tool), 0, 1)), 3)))
+        scored.append(replace(grasp, quality=round(min(max(quality * _hold(grasp, tool), 0.0), 1.0), 3)))
     return sorted(scored, key=_key)
 
 
@@ -55,7 +58,7 @@ def _hold(grasp: Grasp, tool: Tool) -> float:
     if not isinstance(tool, SuctionTool):
         return 1 - grasp.doubt
     doubts = {"seal": min(1.0, grasp.seal_m / tool.compliance_m), "room": 1 - grasp.room}
-    return float(np.prod([1 - DOUBTS[name] * value for name, value in doubts.items()]))
+    return math.prod(1 - DOUBTS[name] * value for name, value in doubts.items())
 
 
 def _key(grasp: Grasp) -> tuple[float, ...]:

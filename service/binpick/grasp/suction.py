@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from binpick import geometry
 from binpick.data import Grasp, Labels, Segments
-from binpick.geometry import Transform
 from binpick.settings import SuctionTool
 
 FIT_RADIUS = 1.1
@@ -21,6 +20,14 @@ SEAL_SHARE = 0.95
 """The measured surface may use this share of the compliance."""
 SECTORS = 16
 """The lip is judged in this many sectors; each must show the part."""
+POINTS_PER_RADIUS = 6
+"""Neighbourhoods are looked at with about this many points along the lip's radius, if there are as many."""
+PEAK_M = 0.004
+"""Of the spots in a square of this side one is tried."""
+LEAST_INSIDE = 0.65
+"""Spots nearer to their segment's border than this share of the lip's radius are not tried; tilt shortens distances."""
+CENTRING_M = 0.0015
+"""What lies this far off the plane says nothing about where the face's middle is."""
 CORRELATED_PX = 8.0
 """Half-resolution pixels that share one independent depth error: a matched block of 5x5 full-resolution pixels and the
 matcher's smoothness."""
@@ -28,10 +35,14 @@ matcher's smoothness."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """The points around each of n spots, in the spot's frame (origin there, z along the normal); NaN = not measured."""
+    """The points around each of n spots, in the spot's frame (origin there, z along the normal); NaN = not measured.
+
+    Every `stride`-th point of every `stride`-th row is there.
+    """
 
     local: Float32[np.ndarray, "n k 3"]
     own: Bool[np.ndarray, "n k"]
+    stride: int
 
 
 def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndarray, "h w"],
@@ -41,71 +52,116 @@ def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndar
     Qualities are 0 until ranked. The pose's z points into the part, x along the part's longest extent.
     """
     cup = tool.cups[0]
-    spots = _spots(segments)
-    reasons = {"spots": len(spots)}
+    spacing_m = _spacing(segments)
+    spots, narrow = _spots(segments, cup.radius_m, spacing_m)
+    reasons = {"spots": len(spots) + narrow, "rim_not_on_one_part": narrow}
     if not len(spots):
         return [], reasons
-    patch, T_bin_spot = _patches(segments, spots, cup.radius_m)
+    patch, T_bin_spot = _centred(*_patches(segments, spots, cup.radius_m, spacing_m), cup.radius_m)
     on_one_part = _sectors(patch, 0.7 * cup.radius_m, 1.15 * cup.radius_m) == SECTORS
-    reasons["rim_not_on_one_part"] = int((~on_one_part).sum())
+    reasons["rim_not_on_one_part"] += int((~on_one_part).sum())
     spots, T_bin_spot = spots[on_one_part], T_bin_spot[on_one_part]
-    seal = _seal(Patch(patch.local[on_one_part], patch.own[on_one_part]), cup.radius_m)
+    seal = _seal(Patch(patch.local[on_one_part], patch.own[on_one_part], patch.stride), cup.radius_m)
     limit_m = SEAL_SHARE * tool.compliance_m
     sealed = (np.maximum(seal.deviation_m, seal.bend_m) <= limit_m) & (seal.stand_out_m <= STAND_OUT_M)
-    upright = np.arccos(np.clip(seal.normal_bin(T_bin_spot)[:, 2], -1, 1)) <= tool.max_tilt_rad
+    normal = seal.normal_bin(T_bin_spot)
+    upright = np.arccos(np.clip(normal[:, 2], -1, 1)) <= tool.max_tilt_rad
     reasons |= {"no_seal": int((~sealed).sum()), "tilt": int((sealed & ~upright).sum())}
-    long_axes = _long_axes(segments)
-    grasps = [_grasp(i, segments, spots, seal, T_bin_spot, long_axes, tool, sigma_z_m)
-              for i in np.flatnonzero(sealed & upright).tolist()]
+    chosen = np.flatnonzero(sealed & upright)
+    grasps = _grasps(chosen, segments, spots[chosen], seal, normal[chosen], T_bin_spot[chosen], tool, sigma_z_m)
     reasons["sealed"] = len(grasps)
     return grasps, reasons
 
 
-def _spots(segments: Segments) -> Int32[np.ndarray, "n 2"]:
-    """Pixels (row, column) worth a try: on faces and on parts, where the border is locally farthest away."""
-    found = [_peaks(labels) for labels in (segments.faces, segments.parts)]
-    spots = np.unique(np.concatenate(found), axis=0).astype(np.int32)
-    usable = np.isfinite(segments.normal[spots[:, 0], spots[:, 1]]).all(axis=1)
-    usable &= segments.parts[spots[:, 0], spots[:, 1]] > 0
-    kept: Int32[np.ndarray, "m 2"] = spots[usable]
-    return kept
+def _spacing(segments: Segments) -> float:
+    """Median distance of neighbouring points of parts, metres; 1 mm when there are none."""
+    parts = segments.parts[::4]
+    place = np.nonzero((parts[:, 1:] > 0) & (parts[:, :-1] == parts[:, 1:]))
+    rows = segments.xyz[::4]
+    steps = rows[place[0], place[1] + 1] - rows[place]
+    return float(np.median(np.linalg.norm(steps, axis=1))) if len(steps) else 0.001
 
 
-def _peaks(labels: Labels) -> Int32[np.ndarray, "n 2"]:
-    """Local maxima of the distance to the segment's border."""
+def _spots(segments: Segments, radius_m: float, spacing_m: float) -> tuple[Int32[np.ndarray, "n 2"], int]:
+    """Pixels (row, column) worth a try: on faces and on parts, where the border is locally farthest away.
+
+    Also how many were left out because the border is too near.
+    """
+    cell = max(1, round(PEAK_M / spacing_m))
+    wide_px = LEAST_INSIDE * radius_m / spacing_m
+    kept, narrow = [], 0
+    for labels in (segments.faces, segments.parts):
+        spots, distance = _peaks(labels, cell)
+        usable = np.isfinite(segments.normal[spots[:, 0], spots[:, 1]]).all(axis=1)
+        usable &= segments.parts[spots[:, 0], spots[:, 1]] > 0
+        narrow += int((usable & (distance < wide_px)).sum())
+        kept.append(spots[usable & (distance >= wide_px)])
+    return np.unique(np.concatenate(kept), axis=0).astype(np.int32), narrow
+
+
+def _peaks(labels: Labels, cell: int) -> tuple[Int32[np.ndarray, "n 2"], Float32[np.ndarray, "n"]]:
+    """Local maxima of the distance to the segment's border, and that distance, px: at most one in a square cell."""
     inner = labels > 0
     inner[:, 1:] &= labels[:, 1:] == labels[:, :-1]
     inner[1:] &= labels[1:] == labels[:-1]
     distance = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5)
     highest = cv2.dilate(distance, np.ones((7, 7), dtype=np.uint8))
-    return np.argwhere((distance >= highest) & (distance > 2)).astype(np.int32)
+    found = np.argwhere((distance >= highest) & (distance > 2))
+    far = distance[found[:, 0], found[:, 1]]
+    columns = labels.shape[1] // cell + 1
+    square = found[:, 0] // cell * columns + found[:, 1] // cell
+    order = np.lexsort((-far, square))
+    _, first = np.unique(square[order], return_index=True)
+    chosen = order[first]
+    return found[chosen].astype(np.int32), far[chosen]
 
 
-def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: float,
+def _patches(segments: Segments, spots: Int32[np.ndarray, "n 2"], radius_m: float, spacing_m: float,
              ) -> tuple[Patch, Float64[np.ndarray, "n 4 4"]]:
     """The neighbourhood of every spot in its own frame."""
     rows, cols = segments.parts.shape
-    near = segments.xyz[spots[:, 0], np.minimum(spots[:, 1] + 1, cols - 1)] - segments.xyz[spots[:, 0], spots[:, 1]]
-    spacing_m = float(np.nanmedian(np.linalg.norm(near, axis=1)))
-    reach = int(np.ceil(SKIRT_RADIUS * 1.3 * radius_m / max(spacing_m, 1e-4)))
-    steps = np.arange(-reach, reach + 1)
-    i = np.clip(spots[:, 0, None, None] + steps[None, :, None], 0, rows - 1)
-    j = np.clip(spots[:, 1, None, None] + steps[None, None, :], 0, cols - 1)
-    i, j = (np.broadcast_to(a, (len(spots), len(steps), len(steps))).reshape(len(spots), -1) for a in (i, j))
-    origin = segments.xyz[spots[:, 0], spots[:, 1]].astype(np.float64)
-    normal = segments.normal[spots[:, 0], spots[:, 1]].astype(np.float64)
-    T_bin_spot = _frames(normal, origin)
-    offset = segments.xyz[i, j] - origin[:, None].astype(np.float32)
+    stride = max(1, int(radius_m / POINTS_PER_RADIUS / max(spacing_m, 1e-4)))
+    reach = int(np.ceil(SKIRT_RADIUS * 1.3 * radius_m / max(spacing_m, 1e-4) / stride))
+    steps = stride * np.arange(-reach, reach + 1)
+    i, j = (side.ravel() for side in np.meshgrid(steps, steps, indexing="ij"))
+    disc = np.hypot(i, j) <= reach * stride
+    i, j = i[disc], j[disc]
+    place = np.clip(spots[:, :1] + i, 0, rows - 1) * cols + np.clip(spots[:, 1:] + j, 0, cols - 1)
+    at = spots[:, 0] * cols + spots[:, 1]
+    xyz, normals, parts = segments.xyz.reshape(-1, 3), segments.normal.reshape(-1, 3), segments.parts.ravel()
+    origin, normal = xyz[at].astype(np.float64), normals[at].astype(np.float64)
+    along = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    T_bin_spot = _frames(normal, along, origin)
+    offset = xyz.take(place, axis=0) - origin[:, None].astype(np.float32)
     local = np.matmul(offset, T_bin_spot[:, :3, :3].astype(np.float32))
-    own = segments.parts[i, j] == segments.parts[spots[:, 0], spots[:, 1]][:, None]
-    return Patch(local=local, own=own), T_bin_spot
+    return Patch(local=local, own=parts.take(place) == parts[at][:, None], stride=stride), T_bin_spot
 
 
-def _frames(normal: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4 4"]:
-    """Frames with z along the normals; x lies in the plane of z and the bin's x, or y where those are parallel."""
-    z = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    hint = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+def _centred(patch: Patch, T_bin_spot: Float64[np.ndarray, "n 4 4"], radius_m: float,
+             ) -> tuple[Patch, Float64[np.ndarray, "n 4 4"]]:
+    """Spots moved along their plane to the middle of what the part shows of it there.
+
+    Pixels are as wide as what a narrow face leaves beside the lip; the mean of many points is finer.
+    """
+    x, y, z = (patch.local[..., a] for a in range(3))
+    with np.errstate(invalid="ignore"):
+        on_face = patch.own & (np.abs(z) < CENTRING_M) & (x * x + y * y < np.float32((SKIRT_RADIUS * radius_m) ** 2))
+    count = np.maximum(on_face.sum(axis=1), 1)
+    shift = np.stack([np.where(on_face, a, np.float32(0)).sum(axis=1) / count for a in (x, y)], axis=-1)
+    local = patch.local.copy()
+    local[..., :2] -= shift[:, None]
+    moved = T_bin_spot.copy()
+    moved[:, :3, 3] += np.einsum("nij,nj->ni", T_bin_spot[:, :3, :2], shift.astype(np.float64))
+    return Patch(local=local, own=patch.own, stride=patch.stride), moved
+
+
+def _frames(z: Float64[np.ndarray, "n 3"], hint: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "n 3"],
+            ) -> Float64[np.ndarray, "n 4 4"]:
+    """Frames with z along the given directions and x the part of the hint square to it, as `geometry.frame_of_axes`."""
+    z = z / np.linalg.norm(z, axis=1, keepdims=True)
     x = hint - (hint * z).sum(axis=1, keepdims=True) * z
+    parallel = np.linalg.norm(x, axis=1) < 1e-9
+    x[parallel] = np.cross(z[parallel], np.eye(3)[np.abs(z[parallel]).argmin(axis=1)])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     frames = np.tile(np.eye(4), (len(z), 1, 1))
     frames[:, :3, 0], frames[:, :3, 1], frames[:, :3, 2], frames[:, :3, 3] = x, np.cross(z, x), z, origin
@@ -150,7 +206,7 @@ def _seal(patch: Patch, radius_m: float) -> Seal:
     bend = _bend(x / radius_m, y / radius_m, residual, under)
     middle = under & (radius <= 0.4 * radius_m)
     return Seal(
-        slope=slope, level_m=level, support=under.sum(axis=1).astype(np.int32),
+        slope=slope, level_m=level, support=(under.sum(axis=1) * patch.stride**2).astype(np.int32),
         centre_m=np.where(middle, residual, 0).sum(axis=1) / np.maximum(middle.sum(axis=1), 1),
         room=_sectors(patch, 1.15 * radius_m, SKIRT_RADIUS * radius_m) / SECTORS,
         bend_m=bend, deviation_m=_quantile(np.abs(residual), under & (radius >= 0.6 * radius_m), 0.90),
@@ -208,28 +264,32 @@ def _quantile(values: Float64[np.ndarray, "n k"], of: Bool[np.ndarray, "n k"], s
     return picked
 
 
-def _long_axes(segments: Segments) -> dict[int, geometry.Vector]:
-    """The direction of the longest extent of every part, bin frame, sign fixed (first non-zero component positive)."""
-    axes = {}
-    for label, points in segments.part_points.items():
-        _, vectors = np.linalg.eigh(np.cov(points.T.astype(np.float64)))
-        axis = vectors[:, 2]
-        axes[label] = axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
-    return axes
+def _long_axis(points: Float32[np.ndarray, "n 3"]) -> geometry.Vector:
+    """The direction of the longest extent of a part, bin frame, sign fixed (first non-zero component positive)."""
+    some = points[::max(1, len(points) // 400)].astype(np.float64)
+    x, y, z = (some - some.mean(axis=0)).T
+    # sums of products by numpy itself: BLAS would wake threads for so little
+    xx, yy, zz, xy, xz, yz = ((a * b).sum() for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z)))
+    _, vectors = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    axis: geometry.Vector = vectors[:, 2]
+    return axis if axis[np.flatnonzero(np.abs(axis) > 1e-9)[0]] > 0 else -axis
 
 
-def _grasp(i: int, segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal, T_bin_spot: Float64[np.ndarray, "n 4 4"],
-           long_axes: dict[int, geometry.Vector], tool: SuctionTool, sigma_z_m: Float32[np.ndarray, "h w"]) -> Grasp:
-    row, col = int(spots[i, 0]), int(spots[i, 1])
-    part = int(segments.parts[row, col])
-    normal = seal.normal_bin(T_bin_spot)[i]
+def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, spots: Int32[np.ndarray, "n 2"], seal: Seal,
+            normal: Float64[np.ndarray, "n 3"], T_bin_spot: Float64[np.ndarray, "n 4 4"], tool: SuctionTool,
+            sigma_z_m: Float32[np.ndarray, "h w"]) -> list[Grasp]:
+    """The chosen spots as grasps; all but the seal holds the chosen only."""
+    part = segments.parts[spots[:, 0], spots[:, 1]]
+    labels, whose = np.unique(part, return_inverse=True)
+    axes = np.array([_long_axis(segments.part_points[label]) for label in labels.tolist()]).reshape(-1, 3)
     # on a curved part the lip's middle lies on the surface, not on the plane through its rim
-    point_local = np.array([0.0, 0.0, seal.level_m[i] + seal.centre_m[i]])
-    T_bin_tcp: Transform = geometry.frame_of_axes(-normal, long_axes[part], geometry.transform(T_bin_spot[i], point_local))
-    sigma_px_m = float(sigma_z_m[row, col])
-    independent = max(1.0, float(seal.support[i]) / CORRELATED_PX)
+    origin = T_bin_spot[:, :3, 3] + T_bin_spot[:, :3, 2] * (seal.level_m + seal.centre_m)[chosen, None]
+    T_bin_tcp = _frames(-normal, axes[whose], origin)
+    sigma_px_m = sigma_z_m[spots[:, 0], spots[:, 1]].astype(np.float64)
+    sigma_m = sigma_px_m / np.sqrt(np.maximum(1.0, seal.support[chosen] / CORRELATED_PX))
     radius_m = tool.cups[0].radius_m
-    return Grasp(T_bin_tcp=T_bin_tcp, tool=tool.number, part_id=part, open_m=0.0, close_m=0.0, quality=0.0,
-                 seal_m=float(seal.bend_m[i]), room=float(seal.room[i]), sigma_xy_m=sigma_px_m / 2,
-                 sigma_z_m=float(sigma_px_m / np.sqrt(independent)),
-                 sigma_tilt_rad=float(2 * sigma_px_m / radius_m / np.sqrt(independent)))
+    return [
+        Grasp(T_bin_tcp=T_bin_tcp[n], tool=tool.number, part_id=label, open_m=0.0, close_m=0.0, quality=0.0,
+              seal_m=float(seal.bend_m[i]), room=float(seal.room[i]), sigma_xy_m=float(sigma_px_m[n] / 2),
+              sigma_z_m=float(sigma_m[n]), sigma_tilt_rad=float(2 * sigma_m[n] / radius_m))
+        for n, (i, label) in enumerate(zip(chosen.tolist(), part.tolist(), strict=True))]

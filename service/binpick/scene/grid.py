@@ -1,62 +1,160 @@
-"""Parts on the pixel grid: cut where the surface jumps or folds inwards, then take connected components.
+"""Parts on the pixel grid: regions between steps and creases, joined where along their whole border one surface goes on.
 
-The idea is that of locally convex connected patches (Stein et al., LCCP, 2014), on the organised grid instead of supervoxels:
-a concave crease separates two parts, a convex one separates two faces of one part.
+The idea is that of locally convex connected patches (Stein et al., LCCP, 2014) on the organised grid: a concave crease
+separates two parts, a convex one two faces of one part. A single link decides nothing, as one leak would merge two parts:
+regions are what hangs together even when its border is taken off, and whether two belong together is asked of all ways across
+their border.
 """
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float64, Int64
+from scipy import sparse
+from scipy.sparse import csgraph
 
-from binpick.data import Cloud, Labels, Mask
+from binpick.data import Labels, Mask
+from binpick.scene.contact import Contacts, Ways, contacts, ways
 from binpick.scene.surface import Surface
 from binpick.settings import SegmentSettings
 
-STEP_M = 0.012
-"""Two neighbouring points further apart than this along z never touch."""
-SIGMAS = 4.0
-"""A jump is larger than this many sigma of depth."""
-
-Cut = Bool[np.ndarray, "links_h links_w"]
+HALF_WAY_M = 0.0025
+"""Half the length of the ways on which steps and bends are looked for."""
+SIGMAS = 3.0
+"""A step is larger than this many sigma of depth."""
+SPECK_M = 0.0015
+"""Cuts and holes smaller than a square of this side cut nothing."""
+CORE_M = 0.0006
+"""What hangs together by less than twice this is two regions."""
+GROWTH_M = 0.010
+"""Regions take back their border this far at most."""
+OFF_M = 0.003
+"""What a region takes back lies at most this far off its tangent plane there."""
+BIG_M2 = 150e-6
+"""Two regions that are both larger are joined on better proof: fragments are, in doubt, of their neighbour."""
+STEP_M, BIG_STEP_M = 0.0014, 0.0005
+"""Largest mean step along a border within a part."""
+BEND_M, BIG_BEND_M = 0.0004, 0.0003
+"""Largest mean concave bend along a border within a part."""
+BORDER_M, BIG_BORDER_M = 0.003, 0.008
+"""Least length of a border within a part."""
+FRAGMENT_M2 = 300e-6
+FRAGMENT_STEP_M, FRAGMENT_BEND_M = 0.0035, 0.0015
+"""At last a smaller region joins the neighbour it shares most border with, when the border's step and bend stay below these."""
 
 
 def segment(surface: Surface, of_interest: Mask, settings: SegmentSettings) -> tuple[Labels, Labels]:
-    """Faces and parts among the pixels of interest; label 0 is nobody, no minimum size yet."""
-    links = [_links(surface, of_interest, settings, axis) for axis in (1, 0)]
-    faces = _components(of_interest, links[0][0], links[1][0])
-    parts = _components(of_interest, links[0][1], links[1][1])
-    return faces, parts
+    """Faces and parts among the pixels of interest; label 0 is nobody, no minimum size yet. Faces end a bit before creases."""
+    spacing_m = spacing(surface, of_interest)
+    if not spacing_m:
+        return np.zeros(of_interest.shape, dtype=np.int32), np.zeros(of_interest.shape, dtype=np.int32)
+    along = ways(surface, of_interest, max(1, round(HALF_WAY_M / spacing_m)))
+    concave, convex = _cuts(along, of_interest, settings)
+    speck = max(2, int((SPECK_M / spacing_m) ** 2))
+    borders = _without_specks(concave & of_interest, speck) | _without_specks(~of_interest, speck)
+    regions = _grown(_cores(of_interest, borders, CORE_M / spacing_m), surface, of_interest, GROWTH_M / spacing_m)
+    parts = _joined(regions, along, spacing_m)
+    return _faces(parts, concave | convex), parts
 
 
-def _links(surface: Surface, of_interest: Mask, settings: SegmentSettings, axis: int) -> tuple[Cut, Cut]:
-    """Whether each pixel holds on to its next neighbour along an axis: as one face, as one part."""
-    def pair(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (field[:, :-1], field[:, 1:]) if axis == 1 else (field[:-1], field[1:])
-
-    p, q = pair(surface.xyz)
-    n_p, n_q = pair(surface.normal)
-    step: Cloud = q - p
-    off_p, off_q = np.abs(_dot(n_p, step)), np.abs(_dot(n_q, step))
-    limit = np.maximum(np.float32(settings.jump_m), np.float32(SIGMAS) * pair(surface.sigma_z_m)[0])
-    both = pair(of_interest)
-    with np.errstate(invalid="ignore"):
-        joined = both[0] & both[1] & (np.minimum(off_p, off_q) < limit) & (np.abs(step[..., 2]) < STEP_M)
-        flat = _dot(n_p, n_q) > np.float32(np.cos(settings.crease_rad))
-        convex = _dot(n_q - n_p, step) > 0
-    return joined & flat, joined & (flat | convex)
+def spacing(surface: Surface, of_interest: Mask) -> float:
+    """Median distance of neighbouring points of every fourth row, metres; 0 when there are none."""
+    both = of_interest[::4, 1:] & of_interest[::4, :-1]
+    step = surface.xyz[::4, 1:][both] - surface.xyz[::4, :-1][both]
+    return float(np.sqrt(np.median(np.einsum("ij,ij->i", step, step)))) if len(step) else 0.0
 
 
-def _dot(a: Cloud, b: Cloud) -> Float32[np.ndarray, "h w"]:
-    product: Float32[np.ndarray, "h w"] = cv2.transform(a * b, np.ones((1, 3), dtype=np.float32))
-    return product
+def _cuts(along: list[Ways], of_interest: Mask, settings: SegmentSettings) -> tuple[Mask, Mask]:
+    """Pixels at steps and concave folds, and those at convex folds: the middles of ways that cross one."""
+    concave, convex = np.zeros(of_interest.shape, dtype=bool), np.zeros(of_interest.shape, dtype=bool)
+    fold = np.float32(HALF_WAY_M * np.sin(settings.crease_rad))
+    for way in along:
+        noise = np.float32(SIGMAS) * way.sigma_m
+        with np.errstate(invalid="ignore"):
+            stepped = np.abs(way.step_m) > np.maximum(np.float32(settings.jump_m), noise)
+            least = np.maximum(fold, np.float32(0.7) * noise)
+            concave[way.middle] |= way.known & (stepped | (way.bend_m > least))
+            convex[way.middle] |= way.known & (way.bend_m < -least)
+    return concave, convex
 
 
-def _components(nodes: Mask, right: Bool[np.ndarray, "h w-1"], down: Bool[np.ndarray, "h-1 w"]) -> Labels:
-    """Connected components of a grid graph, by OpenCV on a grid of twice the size where every link is a pixel of its own."""
-    rows, cols = nodes.shape
-    fine = np.zeros((2 * rows - 1, 2 * cols - 1), dtype=np.uint8)
-    fine[::2, ::2] = nodes
-    fine[::2, 1::2] = right
-    fine[1::2, ::2] = down
-    _, labels = cv2.connectedComponents(fine, connectivity=4, ltype=cv2.CV_32S)
-    return np.ascontiguousarray(labels[::2, ::2]).astype(np.int32)
+def _without_specks(mask: Mask, least: int) -> Mask:
+    """Without components of fewer pixels."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S)
+    keep = stats[:, cv2.CC_STAT_AREA] >= least
+    keep[0] = False
+    kept: Mask = keep[labels]
+    return kept
+
+
+def _cores(of_interest: Mask, borders: Mask, radius_px: float) -> Labels:
+    """Components of what is further than the radius, but at least a pixel, from any border."""
+    distance = cv2.distanceTransform((~borders).astype(np.uint8), cv2.DIST_C, 3)
+    core = of_interest & (distance > max(1, round(radius_px)))
+    _, labels = cv2.connectedComponents(core.astype(np.uint8), connectivity=4, ltype=cv2.CV_32S)
+    return np.asarray(labels, dtype=np.int32)
+
+
+def _grown(cores: Labels, surface: Surface, of_interest: Mask, reach_px: float) -> Labels:
+    """Pixels around the cores go to the nearest one, if they lie near its surface there; what is left is regions of its own."""
+    _, nearest = cv2.distanceTransformWithLabels((cores == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    regions = cores.copy()
+    if cores.any():
+        source = np.zeros(int(nearest.max()) + 1, dtype=np.int64)
+        inside = np.flatnonzero(cores)
+        source[nearest.ravel()[inside]] = inside
+        place = np.flatnonzero(of_interest & (cores == 0))
+        origin = source[nearest.ravel()[place]]
+        xyz, normal = surface.xyz.reshape(-1, 3), surface.normal.reshape(-1, 3)
+        off = np.abs(np.einsum("ij,ij->i", normal[origin], xyz[place] - xyz[origin]))
+        row, col = np.divmod(place, cores.shape[1])
+        row_of, col_of = np.divmod(origin, cores.shape[1])
+        near = (off < OFF_M) & (np.hypot(row - row_of, col - col_of) <= reach_px)
+        regions.ravel()[place[near]] = cores.ravel()[origin[near]]
+    _, rest = cv2.connectedComponents((of_interest & (regions == 0)).astype(np.uint8), connectivity=4, ltype=cv2.CV_32S)
+    return np.where(rest > 0, rest + regions.max(), regions).astype(np.int32)
+
+
+def _joined(regions: Labels, along: list[Ways], spacing_m: float) -> Labels:
+    """Regions joined to parts; 0 stays nobody."""
+    touching = contacts(regions, along)
+    area: Float64[np.ndarray, "p"] = np.bincount(regions.ravel()) * spacing_m**2
+    big = np.minimum(area[touching.first], area[touching.second]) > BIG_M2
+    same = np.abs(touching.step_m) < np.where(big, BIG_STEP_M, STEP_M)
+    same &= touching.bend_m < np.where(big, BIG_BEND_M, BEND_M)
+    # each pixel along a border is crossed by about four ways
+    same &= touching.count * spacing_m / 4 >= np.where(big, BIG_BORDER_M, BORDER_M)
+    group = _groups(len(area), touching.first[same], touching.second[same])
+    touching, area = touching.merged(group), np.bincount(group, weights=area).astype(np.float64)
+    likely = np.minimum(area[touching.first], area[touching.second]) < FRAGMENT_M2
+    likely &= (np.abs(touching.step_m) < FRAGMENT_STEP_M) & (touching.bend_m < FRAGMENT_BEND_M)
+    fragments = _groups(len(area), *_best(area, touching, likely))
+    parts: Labels = fragments[group].astype(np.int32)[regions]
+    return parts
+
+
+def _best(area: Float64[np.ndarray, "p"], touching: Contacts, likely: Bool[np.ndarray, "n"],
+          ) -> tuple[Int64[np.ndarray, "m"], Int64[np.ndarray, "m"]]:
+    """For the smaller region of every likely contact the one it shares most border with."""
+    first, second, count = touching.first[likely], touching.second[likely], touching.count[likely]
+    swap = area[second] < area[first]
+    small, large = np.where(swap, second, first), np.where(swap, first, second)
+    order = np.lexsort((large, -count, small))
+    _, best = np.unique(small[order], return_index=True)
+    return small[order][best], large[order][best]
+
+
+def _groups(count: int, first: Int64[np.ndarray, "n"], second: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "c"]:
+    """The group of each of `count` regions when pairs of them are made one; 0, which no pair may hold, stays 0."""
+    graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+    _, group = csgraph.connected_components(graph, directed=False)
+    # nobody is region 0, a component of its own and the first
+    return np.asarray(group, dtype=np.int64)
+
+
+def _faces(parts: Labels, creases: Mask) -> Labels:
+    """Components of the parts' pixels off all creases."""
+    inner = (parts > 0) & ~creases
+    inner[:, 1:] &= (parts[:, 1:] == parts[:, :-1]) | (parts[:, :-1] == 0)
+    inner[1:] &= (parts[1:] == parts[:-1]) | (parts[:-1] == 0)
+    _, faces = cv2.connectedComponents(inner.astype(np.uint8), connectivity=4, ltype=cv2.CV_32S)
+    return np.asarray(faces, dtype=np.int32)

@@ -18,12 +18,15 @@ def height_map(xyz_bin: Cloud, model: Bin) -> HeightMap:
     """
     length, width, height_m = model.inner_size_m
     cols, rows = int(np.ceil(length / CELL_M)), int(np.ceil(width / CELL_M))
-    points = xyz_bin[np.isfinite(xyz_bin[..., 2])]
-    j = np.floor((points[:, 0] + length / 2) / CELL_M).astype(np.int32)
-    i = np.floor((points[:, 1] + width / 2) / CELL_M).astype(np.int32)
-    inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
+    x, y, z = cv2.split(xyz_bin)
+    x += np.float32(length / 2)
+    y += np.float32(width / 2)
+    with np.errstate(invalid="ignore"):
+        inside = (x >= 0) & (x < length) & (y >= 0) & (y < width)
+    # x and y are not negative here: cutting off the decimals rounds down; a cell may stick out of the bin by a part of its edge
+    j, i = ((side[inside] / np.float32(CELL_M)).astype(np.int32) for side in (x, y))
     heights = np.full(rows * cols, -np.inf, dtype=np.float32)
-    np.maximum.at(heights, (i * cols + j)[inside], np.maximum(points[inside, 2], np.float32(0)))
+    np.maximum.at(heights, np.minimum(i, rows - 1) * cols + np.minimum(j, cols - 1), np.maximum(z[inside], np.float32(0)))
     heights[np.isneginf(heights)] = np.nan
     grid = heights.reshape(rows, cols)
     coverage = float(np.isfinite(grid).mean())

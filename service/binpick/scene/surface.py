@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from binpick import geometry
 from binpick.data import Cloud, Depth, Mask, Rectified
@@ -22,6 +22,12 @@ WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RA
 """Where the fit windows around a pixel are centred (row, column): on it, or with it at their corner."""
 
 
+Box = tuple[geometry.Vector, geometry.Vector]
+"""Lowest and highest corner."""
+Field = Float32[np.ndarray, "h w"]
+Values = Float32[np.ndarray, "n"]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Points and unit normals (towards the camera) in the bin's frame, NaN = not measured; sigma_z_m of one pixel."""
@@ -30,31 +36,43 @@ class Surface:
     normal: Cloud
     sigma_z_m: Float32[np.ndarray, "h w"]
 
+    def cut(self, box: tuple[slice, slice]) -> "Surface":
+        """Its rows and columns in a box."""
+        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box])
 
-def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform) -> Surface:
-    """The surface of the window at half resolution."""
+
+def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform, box_bin: Box | None = None) -> Surface:
+    """The surface of the window at half resolution; normals only of what lies in a box of the bin's frame, if one is given."""
     disparity, sigma_px = _half(depth)
     view = rectified.window
     rows, cols = disparity.shape
     # the centre of half-resolution pixel j lies at full-resolution 2 j + 0.5
     u = (2 * np.arange(cols) + 0.5 + view.x - rectified.cx_px).astype(np.float32)
     v = (2 * np.arange(rows) + 0.5 + view.y - rectified.cy_px).astype(np.float32)
-    slope_u, slope_v, level = _planes(disparity)
     f = np.float32(rectified.focal_px)
+    z = np.float32(rectified.focal_px * rectified.baseline_m) / disparity
+    T_bin_rect = T_bin_camera @ rectified.T_camera_rect
+    xyz = geometry.transform(T_bin_rect, cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z]))
+    wanted = np.isfinite(disparity) if box_bin is None else _inside(xyz, box_bin)
+    place, slope_u, slope_v, level = _planes(disparity, wanted)
+    row, col = np.divmod(place, cols)
     # a u + b v + c = f b / z  =>  n ~ (a f, b f, a (u - cx) .. + c) with u, v counted from the principal point
     a, b = slope_u / 2, slope_v / 2
-    c = level - a * u[None, :] - b * v[:, None]
+    c = level - a * u[col] - b * v[row]
     a, b = a * f, b * f
     towards = -1 / np.sqrt(a * a + b * b + c * c)
-    normal = cv2.merge([a * towards, b * towards, c * towards])
-    z = np.float32(rectified.focal_px * rectified.baseline_m) / disparity
-    rect = cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z])
-    T_bin_rect = T_bin_camera @ rectified.T_camera_rect
+    normal = np.full((rows * cols, 3), np.nan, dtype=np.float32)
+    normal[place] = geometry.rotate(T_bin_rect, np.stack([a * towards, b * towards, c * towards], axis=-1))
     sigma = z * z * sigma_px * np.float32(1 / (rectified.focal_px * rectified.baseline_m))
-    return Surface(xyz=geometry.transform(T_bin_rect, rect), normal=geometry.rotate(T_bin_rect, normal), sigma_z_m=sigma)
+    return Surface(xyz=xyz, normal=normal.reshape(xyz.shape), sigma_z_m=sigma)
 
 
-def _half(depth: Depth) -> tuple["Field", "Field"]:
+def _inside(xyz: Cloud, box: Box) -> Mask:
+    """Points in a box, borders included; NaN lies in none."""
+    return np.asarray(cv2.inRange(xyz, *(tuple(corner.tolist()) for corner in box)) > 0)
+
+
+def _half(depth: Depth) -> tuple[Field, Field]:
     """Mean disparity and sigma of each 2x2 block with at least two measured pixels, else NaN."""
     rows, cols = depth.disparity.shape[0] // 2, depth.disparity.shape[1] // 2
     known = depth.measured[:2 * rows, :2 * cols]
@@ -66,28 +84,40 @@ def _half(depth: Depth) -> tuple["Field", "Field"]:
     return disparity, sigma_px
 
 
-Field = Float32[np.ndarray, "h w"]
-
-
-def _planes(disparity: Field) -> tuple[Field, Field, Field]:
-    """Slopes per half-resolution px and level of the best plane at each measured pixel; NaN where none has support."""
-    known = np.isfinite(disparity)
-    slope_u, slope_v, level, misfit = _fits(disparity, known)
-    rows, cols = disparity.shape
-    framed = np.pad(misfit, RADIUS, constant_values=np.inf)
-    errors = [framed[RADIUS + dv:RADIUS + dv + rows, RADIUS + du:RADIUS + du + cols] for dv, du in WINDOWS]
-    best, choice = errors[0].copy(), np.zeros(disparity.shape, dtype=np.int8)
-    for k, error in enumerate(errors[1:], 1):
-        choice[error < best] = k
+def _planes(disparity: Field, wanted: Mask) -> tuple[Int64[np.ndarray, "n"], Values, Values, Values]:
+    """Those wanted pixels, in reading order, whose best plane has support: its slopes per half-resolution px and its level."""
+    cols = disparity.shape[1]
+    box = around(wanted, 2 * RADIUS)
+    near = np.ascontiguousarray(disparity[box])
+    slope_u, slope_v, level, misfit = (field.ravel() for field in _fits(near, np.isfinite(near)))
+    width = near.shape[1]
+    row, col = np.nonzero(wanted[box])
+    # what the windows reach beyond the window's border has no support
+    framed = np.pad(misfit.reshape(near.shape), RADIUS, constant_values=np.inf).ravel()
+    at = (row + RADIUS) * (width + 2 * RADIUS) + col + RADIUS
+    best, source = framed[at], row * width + col
+    centre = source.copy()
+    for dv, du in WINDOWS[1:]:
+        error = framed[at + dv * (width + 2 * RADIUS) + du]
+        better = error < best
+        source[better] = centre[better] + dv * width + du
         np.minimum(best, error, out=best)
-    found = np.flatnonzero(known & np.isfinite(best))
-    dv, du = np.array(WINDOWS, dtype=np.int32)[choice.ravel()[found]].T
-    source = found + dv * cols + du
-    planes = [np.full(disparity.size, np.nan, dtype=np.float32) for _ in range(3)]
-    a, b = slope_u.ravel()[source], slope_v.ravel()[source]
-    planes[0][found], planes[1][found] = a, b
-    planes[2][found] = level.ravel()[source] - a * du - b * dv
-    return planes[0].reshape(rows, cols), planes[1].reshape(rows, cols), planes[2].reshape(rows, cols)
+    found = np.isfinite(best)
+    source, row, col = source[found], row[found], col[found]
+    a, b = slope_u[source], slope_v[source]
+    down, right = source // width - row, source % width - col
+    place = (row + box[0].start) * cols + col + box[1].start
+    return place, a, b, (level[source] - a * right - b * down).astype(np.float32)
+
+
+def around(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
+    """The smallest box that holds a mask, with a margin as far as there are pixels; the first pixel if it is empty."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return slice(0, 1), slice(0, 1)
+    high, wide = (slice(max(0, int(side[0]) - margin), min(count, int(side[-1]) + 1 + margin))
+                  for side, count in zip((rows, cols), mask.shape, strict=True))
+    return high, wide
 
 
 def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:

@@ -56,7 +56,7 @@ class SegmentSettings(Strict):
     """grid: jumps and creases on the pixel grid; open3d: voxels, normals and DBSCAN on the unorganised cloud."""
     crease_rad: Annotated[float, Field(ge=0.05, le=1.5)] = 0.38
     """Angle between neighbouring normals that ends a face, radians."""
-    jump_m: Annotated[float, Field(ge=0.0005, le=0.05)] = 0.0035
+    jump_m: Annotated[float, Field(ge=0.0005, le=0.05)] = 0.0016
     """Step off the tangent plane that ends a part, metres."""
 
 
