@@ -82,7 +82,7 @@ def test_a_part_at_a_wall_that_only_a_slimmer_tool_could_reach(photograph):
     wide = Cylinder(shape="cylinder", radius_m=0.06, length_m=0.1,
                     T_tcp_body={"position_m": (0.0, 0.0, -0.06)})
     tool = inputs.job.tool.model_copy(update={"bodies": (wide,)})
-    result = seen(replace(inputs, job=inputs.job.model_copy(update={"tool": tool})))
+    result = seen(replace(inputs, job=inputs.job.model_copy(update={"tools": (tool,)})))
     assert result.return_code.code is Code.ALL_COLLIDE
     assert result.funnel.dominating == "collide"
     assert result.funnel.counts["collide"] > result.funnel.counts["clear"] == 0
