@@ -131,7 +131,7 @@ class Device:
             case "AcquisitionStop":
                 self._stop_acquisition()
             case "TriggerSoftware":
-                self._trigger(arrived_ns)
+                self.trigger(arrived_ns)
             case "GevTimestampControlLatch":
                 self.registers.set("GevTimestampValue", device_clock_ns())
             case "PtpEnable":
@@ -147,9 +147,9 @@ class Device:
         return (socket.inet_ntoa(self.registers.integer("GevSCDA").to_bytes(4, "big")),
                 self.registers.integer("GevSCPHostPort"))
 
-    def _resend(self, block: int, first: int, last: int) -> None:
+    def _resend(self, block: int, first: int, last: int, arrived_ns: int) -> None:
         with suppress(OSError):
-            self.sender.resend(self._target(), block, first, last)
+            self.sender.resend(self._target(), block, first, last, arrived_ns)
 
     def _start_acquisition(self) -> None:
         with self._state:
@@ -160,7 +160,8 @@ class Device:
         with self._state:
             self._acquiring, self._pending = False, None
 
-    def _trigger(self, arrived_ns: int) -> None:
+    def trigger(self, arrived_ns: int) -> None:
+        """Starts one exposure, if it is ready for one."""
         read = self.registers.integer
         with self._state:
             ready = self._acquiring and self._pending is None and read("TriggerMode") == 1
