@@ -233,8 +233,39 @@ def test_lost_packets_are_sent_again(gige_addresses: tuple[str, str]) -> None:
         assert min(gige.resent(0), gige.resent(1)) > 5 * 20      # of 1609 packets a frame, 32 on average are lost
 
 
+@contextlib.contextmanager
+def tearing(addresses: tuple[str, str], images: int) -> Iterator[CameraGroup]:
+    """A group whose first images lose half of their packets for good."""
+    def image(index: int, _light: Light, shot: int) -> Image:
+        pair.drop_packets(0.5 if shot <= images else 0.0, seed=shot, resends=shot > images)
+        return coded(index, shot)
+
+    pair = GigePair(image, addresses, (WIDTH, HEIGHT))
+    with pair, contextlib.closing(CameraGroup(aravis(addresses), max_skew_us=1_000_000.0)) as group:
+        group.open(within(5))
+        yield group
+
+
 @pytest.mark.gige
-def test_an_incomplete_image_is_refused(gige: GigePair, group: CameraGroup) -> None:
+def test_an_incomplete_image_is_shot_again(gige_addresses: tuple[str, str]) -> None:
+    with tearing(gige_addresses, 1) as group:
+        pair = group.capture(LIGHT, within(3))
+        assert [frame.frame_id for frame in (pair.left, pair.right)] == [2, 2]
+        assert np.array_equal(pair.right.image, coded(1, 2))
+        assert [(s.connected, s.error, s.frames, s.failures) for s in group.statuses()] == [(True, "", 1, 1)] * 2
+
+
+@pytest.mark.gige
+def test_an_image_that_stays_incomplete_is_refused(gige_addresses: tuple[str, str]) -> None:
+    with tearing(gige_addresses, 3) as group:
+        with pytest.raises(PairRefused, match=r"left: the image came incomplete .*right: the image came incomplete"):
+            group.capture(LIGHT, within(5))
+        assert [(status.connected, status.failures) for status in group.statuses()] == [(True, 3), (True, 3)]
+        assert group.capture(LIGHT, within(3)).left.frame_id == 4
+
+
+@pytest.mark.gige
+def test_a_link_that_loses_nearly_everything_gives_no_image(gige: GigePair, group: CameraGroup) -> None:
     gige.drop_packets(0.97, seed=1)
     with pytest.raises(CameraError, match="left") as caught:
         group.capture(LIGHT, within(3))
@@ -242,6 +273,18 @@ def test_an_incomplete_image_is_refused(gige: GigePair, group: CameraGroup) -> N
     gige.drop_packets(0.0, seed=1)
     group.open(within(5))
     assert group.capture(LIGHT, within(3)).left.missing == 0
+
+
+@pytest.mark.gige
+def test_an_image_that_nobody_asked_for_is_never_taken_for_the_next(gige: GigePair, group: CameraGroup) -> None:
+    for _ in range(2):
+        group.capture(LIGHT, within(3))
+    gige.misfire(0)
+    time.sleep(0.1)
+    with pytest.raises(CameraLost, match="left sent an image that it was not triggered for"):
+        group.capture(LIGHT, within(3))
+    group.open(within(5))
+    assert group.capture(LIGHT, within(3)).left.frame_id == 1
 
 
 @pytest.mark.gige
