@@ -270,7 +270,7 @@ def test_an_image_that_stays_incomplete_is_refused(gige_addresses: tuple[str, st
 @pytest.mark.gige
 def test_a_link_that_loses_nearly_everything_gives_no_image(gige: GigePair, group: CameraGroup) -> None:
     gige.drop_packets(0.97, seed=1)
-    with pytest.raises(CameraError, match="left( took the trigger but sent no image|: the image came incomplete)"):
+    with pytest.raises(CameraError, match=r"left( took the trigger but sent no image|: the image came incomplete)"):
         group.capture(LIGHT, within(5))
     gige.drop_packets(0.0, seed=1)
     group.open(within(5))
