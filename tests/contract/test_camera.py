@@ -158,28 +158,28 @@ def test_a_closed_camera_refuses(cameras: tuple[Camera, Camera]) -> None:
     camera.close()
 
 
-def test_without_a_trigger_there_is_no_frame(cameras: tuple[Camera, Camera]) -> None:
+def test_without_a_trigger_there_is_no_frame(cameras: tuple[Camera, Camera], clock: Callable[[], float]) -> None:
     camera = cameras[0]
     camera.open(within(5))
     camera.configure(LIGHT, within(2))
-    start = time.monotonic()
+    start = clock()
     with pytest.raises(CameraLost, match="left") as caught:
         camera.grab(1, within(0.3))
-    assert time.monotonic() - start < 0.5
+    assert clock() - start < 0.5
     assert caught.value.camera == "left"
 
 
-def test_closing_twice_and_opening_again(cameras: tuple[Camera, Camera]) -> None:
+def test_closing_twice_and_opening_again(cameras: tuple[Camera, Camera], clock: Callable[[], float]) -> None:
     camera = cameras[0]
     for sequence in (1, 2):
         camera.open(within(5))
         camera.configure(LIGHT, within(2))
         camera.trigger(sequence, within(2))
         assert camera.grab(sequence, within(3)).sequence == sequence
-        start = time.monotonic()
+        start = clock()
         camera.close()
         camera.close()
-        assert time.monotonic() - start < 1
+        assert clock() - start < 1
 
 
 def test_group_makes_pairs(cameras: tuple[Camera, Camera]) -> None:
@@ -206,17 +206,20 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.gige
-def test_fifty_full_size_pairs_arrive_bit_exact(gige_addresses: tuple[str, str]) -> None:
+def test_fifty_full_size_pairs_arrive_bit_exact(gige_addresses: tuple[str, str], clock: Callable[[], float]) -> None:
     images = [coded(index, 0, FULL) for index in (0, 1)]
     shoot = GigePair(lambda index, _light, shot: images[index] + np.uint8(shot), gige_addresses, FULL)
     with shoot, contextlib.closing(CameraGroup(aravis(gige_addresses), max_skew_us=1_000_000.0)) as group:
         group.open(within(5))
+        failures = [0, 0]
         for shot in range(1, 51):
+            held_s = time.monotonic() - clock()
             pair = group.capture(LIGHT, within(3))
             for index, frame in enumerate((pair.left, pair.right)):
                 assert frame.frame_id >= shot
                 assert np.array_equal(frame.image, images[index] + np.uint8(frame.frame_id)), (index, shot)
-        assert [status.failures for status in group.statuses()] == [0, 0]
+            known, failures = failures, [status.failures for status in group.statuses()]
+            assert failures == known or time.monotonic() - clock() - held_s > 0.1       # by the machine
 
 
 @pytest.mark.gige
@@ -233,31 +236,73 @@ def test_lost_packets_are_sent_again(gige_addresses: tuple[str, str]) -> None:
         assert min(gige.resent(0), gige.resent(1)) > 5 * 20      # of 1609 packets a frame, 32 on average are lost
 
 
+@contextlib.contextmanager
+def tearing(addresses: tuple[str, str], images: int) -> Iterator[CameraGroup]:
+    """A group whose first images lose half of their packets for good."""
+    def image(index: int, _light: Light, shot: int) -> Image:
+        pair.drop_packets(0.5 if shot <= images else 0.0, seed=shot, resends=shot > images)
+        return coded(index, shot)
+
+    pair = GigePair(image, addresses, (WIDTH, HEIGHT))
+    with pair, contextlib.closing(CameraGroup(aravis(addresses), max_skew_us=1_000_000.0)) as group:
+        group.open(within(5))
+        yield group
+
+
 @pytest.mark.gige
-def test_an_incomplete_image_is_refused(gige: GigePair, group: CameraGroup) -> None:
+def test_an_incomplete_image_is_shot_again(gige_addresses: tuple[str, str]) -> None:
+    with tearing(gige_addresses, 1) as group:
+        pair = group.capture(LIGHT, within(3))
+        assert [frame.frame_id for frame in (pair.left, pair.right)] == [2, 2]
+        assert np.array_equal(pair.right.image, coded(1, 2))
+        assert [(s.connected, s.error, s.frames, s.failures) for s in group.statuses()] == [(True, "", 1, 1)] * 2
+
+
+@pytest.mark.gige
+def test_an_image_that_stays_incomplete_is_refused(gige_addresses: tuple[str, str]) -> None:
+    with tearing(gige_addresses, 3) as group:
+        with pytest.raises(PairRefused, match=r"left: the image came incomplete .*right: the image came incomplete"):
+            group.capture(LIGHT, within(5))
+        assert [(status.connected, status.failures) for status in group.statuses()] == [(True, 3), (True, 3)]
+        assert group.capture(LIGHT, within(3)).left.frame_id == 4
+
+
+@pytest.mark.gige
+def test_a_link_that_loses_nearly_everything_gives_no_image(gige: GigePair, group: CameraGroup) -> None:
     gige.drop_packets(0.97, seed=1)
-    with pytest.raises(CameraError, match="left") as caught:
-        group.capture(LIGHT, within(3))
-    assert isinstance(caught.value, PairRefused | CameraLost)
+    with pytest.raises(CameraError, match=r"left( took the trigger but sent no image|: the image came incomplete)"):
+        group.capture(LIGHT, within(5))
     gige.drop_packets(0.0, seed=1)
     group.open(within(5))
     assert group.capture(LIGHT, within(3)).left.missing == 0
 
 
 @pytest.mark.gige
-def test_cameras_killed_in_mid_exposure(gige: GigePair, group: CameraGroup) -> None:
+def test_an_image_that_nobody_asked_for_is_never_taken_for_the_next(gige: GigePair, group: CameraGroup) -> None:
+    for _ in range(2):
+        group.capture(LIGHT, within(3))
+    gige.misfire(0)
+    time.sleep(0.1)
+    with pytest.raises(CameraLost, match="left sent an image that it was not triggered for"):
+        group.capture(LIGHT, within(3))
+    group.open(within(5))
+    assert group.capture(LIGHT, within(3)).left.frame_id == 1
+
+
+@pytest.mark.gige
+def test_cameras_killed_in_mid_exposure(gige: GigePair, group: CameraGroup, clock: Callable[[], float]) -> None:
     group.capture(LIGHT, within(3))
     killers = [threading.Timer(0.1, gige.kill, (index,)) for index in (0, 1)]
     for killer in killers:
         killer.start()
-    start = time.monotonic()
+    start = clock()
     with pytest.raises(CameraLost, match=r"left.*right"):
         group.capture(Light(exposure_us=300_000.0, gain_db=0.0, projector=False), within(10))
-    assert time.monotonic() - start < 2
+    assert clock() - start < 2
     assert all(status.error and not status.connected for status in group.statuses())
-    start = time.monotonic()
+    start = clock()
     group.close()
-    assert time.monotonic() - start < 1
+    assert clock() - start < 1
     for index in (0, 1):
         gige.restart(index)
     group.open(within(5))
@@ -266,12 +311,12 @@ def test_cameras_killed_in_mid_exposure(gige: GigePair, group: CameraGroup) -> N
 
 
 @pytest.mark.gige
-def test_a_dead_camera_delays_no_verb(gige: GigePair, group: CameraGroup) -> None:
+def test_a_dead_camera_delays_no_verb(gige: GigePair, group: CameraGroup, clock: Callable[[], float]) -> None:
     gige.kill(1)
-    start = time.monotonic()
+    start = clock()
     with pytest.raises(CameraLost, match="right stopped answering while setting") as caught:
         group.capture(LIGHT, within(10))
-    assert time.monotonic() - start < 1.5
+    assert clock() - start < 1.5
     assert caught.value.camera == "right"
     left, right = group.statuses()
     assert (left.connected, left.error) == (True, "")
@@ -308,12 +353,12 @@ def test_a_held_camera_is_refused_and_not_disturbed(two: tuple[Camera, Camera], 
 
 
 @pytest.mark.gige
-def test_nobody_there() -> None:
+def test_nobody_there(clock: Callable[[], float]) -> None:
     camera, _ = aravis((NOBODY, NOBODY))
-    start = time.monotonic()
+    start = clock()
     with pytest.raises(CameraNotFound, match=f"no camera answers at {NOBODY}: check power, cable and the address"):
         camera.open(within(5))
-    assert time.monotonic() - start < 2
+    assert clock() - start < 2
     assert "no camera answers" in camera.status().error
 
 
@@ -370,10 +415,10 @@ def test_the_left_line_fires_the_projector_for_both(gige_addresses: tuple[str, s
 
 
 @pytest.mark.gige
-def test_the_simulator_stops_within_a_second_and_names_a_port_in_use(gige: GigePair,
-                                                                     gige_addresses: tuple[str, str]) -> None:
+def test_the_simulator_stops_within_a_second_and_names_a_port_in_use(gige: GigePair, gige_addresses: tuple[str, str],
+                                                                     clock: Callable[[], float]) -> None:
     with pytest.raises(PortInUse, match="3956"):
         pair_of(gige_addresses).start()
-    start = time.monotonic()
+    start = clock()
     gige.stop()
-    assert time.monotonic() - start < 1
+    assert clock() - start < 1

@@ -50,6 +50,7 @@ class Cell:
     log: Path
     base: str
     modbus_port: int
+    clock: Callable[[], float]
 
     def get(self, path: str) -> httpx.Response:
         return httpx.get(f"{self.base}{path}", timeout=5)
@@ -66,12 +67,12 @@ class Cell:
 
     def wait(self, until: Callable[[], bool], what: str, limit_s: float = BACK_S) -> float:
         """Seconds until it is so."""
-        start = time.monotonic()
+        start = self.clock()
         while not until():
-            if time.monotonic() - start > limit_s:
+            if self.clock() - start > limit_s:
                 pytest.fail(f"not {what} within {limit_s:.0f} s; {self.health()}\n{self.log.read_text()}")
             time.sleep(0.02)
-        return time.monotonic() - start
+        return self.clock() - start
 
 
 class Registers:
@@ -168,7 +169,7 @@ publish: {{rest: {{port: {ports[0]}}}, modbus: {{host: 127.0.0.1, port: {ports[1
 
 
 @contextlib.contextmanager
-def daemon(folder: Path, gige: GigePair, control: str, heartbeat_ms: int = 3000) -> Iterator[Cell]:
+def daemon(folder: Path, gige: GigePair, control: str, clock: Callable[[], float], heartbeat_ms: int = 3000) -> Iterator[Cell]:
     """`binpick run` once it serves; killed if the test leaves it alive."""
     ports = free_ports()
     environment = {key: value for key, value in os.environ.items() if key != "PYTEST_CURRENT_TEST"}
@@ -183,7 +184,7 @@ def daemon(folder: Path, gige: GigePair, control: str, heartbeat_ms: int = 3000)
             assert process.poll() is None, log.read_text()
             assert time.monotonic() < until, log.read_text()
             time.sleep(0.05)
-        yield Cell(process, log, f"http://127.0.0.1:{ports[0]}", ports[1])
+        yield Cell(process, log, f"http://127.0.0.1:{ports[0]}", ports[1], clock)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -193,10 +194,10 @@ def daemon(folder: Path, gige: GigePair, control: str, heartbeat_ms: int = 3000)
 def ends_well(cell: Cell) -> float:
     """SIGTERM: exit code 0 within 3 s and nothing left; how long it took."""
     children = psutil.Process(cell.process.pid).children(recursive=True)
-    sent = time.monotonic()
+    sent = cell.clock()
     cell.process.send_signal(signal.SIGTERM)
     assert cell.process.wait(10) == 0, cell.log.read_text()
-    took = time.monotonic() - sent
+    took = cell.clock() - sent
     assert took < 3
     assert [child for child in children if child.is_running()] == []
     assert "Traceback" not in cell.log.read_text(), cell.log.read_text()
@@ -226,33 +227,32 @@ def event(cell: Cell) -> str:
         return next(line for line in response.iter_lines() if line.startswith("data:"))
 
 
-def kill(gige: GigePair, *indices: int) -> float:
-    """At once, not one after the other; the instant."""
+def kill(gige: GigePair, *indices: int) -> None:
+    """At once, not one after the other."""
     killers = [threading.Thread(target=gige.kill, args=(index,)) for index in indices]
-    now = time.monotonic()
     for killer in killers:
         killer.start()
     for killer in killers:
         killer.join()
-    return now
 
 
-def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: GigePair) -> None:
-    with daemon(tmp_path, gige, "rest") as cell:
+def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: GigePair, clock: Callable[[], float]) -> None:
+    with daemon(tmp_path, gige, "rest", clock) as cell:
         cell.wait(cell.ready, "ready")
         with started(cell) as answer:
-            asked = time.monotonic()
+            asked = clock()
             refused = cell.cycle()
             assert (refused.status_code, refused.json()["code"]) == (409, BUSY_CODE)
-            assert time.monotonic() - asked < 0.3
+            assert clock() - asked < 0.3
         assert answer.result().status_code == 200, answer.result().text      # unharmed by the one that was refused
         assert cell.cycle(timeout_ms=int(500 * EXPOSURE_S)).json()["code"] == TIMEOUT
         assert camera_reasons(cell) == []                                    # a short limit is no fault of theirs
         cell.wait(cell.ready, "ready")
         with started(cell) as answer:
-            dead = kill(gige, 0, 1)
+            dead = clock()
+            kill(gige, 0, 1)
             problem = answer.result().json()
-            assert time.monotonic() - dead < 2
+            assert clock() - dead < 2
         assert (answer.result().status_code, problem["code"]) == (503, CAMERAS)
         assert re.search("left.*check.*right.*check", problem["detail"]), problem
         assert cell.get("/v1/health/ready").status_code == 503
@@ -268,8 +268,8 @@ def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: Gi
         ends_well(cell)
 
 
-def test_both_killed_in_mid_exposure_over_modbus_and_back(tmp_path: Path, gige: GigePair) -> None:
-    with daemon(tmp_path, gige, "modbus") as cell, Registers(cell.modbus_port) as plc:
+def test_both_killed_in_mid_exposure_over_modbus_and_back(tmp_path: Path, gige: GigePair, clock: Callable[[], float]) -> None:
+    with daemon(tmp_path, gige, "modbus", clock) as cell, Registers(cell.modbus_port) as plc:
         plc.write(0, ENABLE)
         plc.until(READY)
         assert plc.read(14, 1)[0] == BOTH_CONNECTED
@@ -287,9 +287,10 @@ def test_both_killed_in_mid_exposure_over_modbus_and_back(tmp_path: Path, gige: 
         plc.trigger(3)
         plc.until(ACK)
         time.sleep(EXPOSURE_S / 5)
-        dead = kill(gige, 0, 1)
+        dead = clock()
+        kill(gige, 0, 1)
         plc.until(ERROR)
-        assert time.monotonic() - dead < 2
+        assert clock() - dead < 2
         status, *_, states, latched = plc.read(10, 6)
         assert status & (READY | VALID | BUSY) == 0
         assert (signed(latched), signed(plc.read(105, 1)[0])) == (CAMERAS, CAMERAS)
@@ -315,32 +316,33 @@ def acknowledged(plc: Registers) -> None:
     plc.write(0, ENABLE)
 
 
-def latencies_ms(plc: Registers, stop: threading.Event, reads: Callable[[float], None]) -> None:
+def latencies_ms(plc: Registers, stop: threading.Event, reads: Callable[[float], None], clock: Callable[[], float]) -> None:
     while not stop.wait(0.002):
-        asked = time.perf_counter()
+        asked = clock()
         plc.read(100, 125)
-        reads(1000 * (time.perf_counter() - asked))
+        reads(1000 * (clock() - asked))
 
 
-def test_one_killed_is_named_alone_and_its_stuck_thread_delays_nobody(tmp_path: Path, gige: GigePair) -> None:
+def test_one_killed_is_named_alone_and_its_stuck_thread_delays_nobody(tmp_path: Path, gige: GigePair,
+                                                                      clock: Callable[[], float]) -> None:
     reads: list[float] = []
     stop = threading.Event()
-    with daemon(tmp_path, gige, "rest") as cell, Registers(cell.modbus_port) as plc:
+    with daemon(tmp_path, gige, "rest", clock) as cell, Registers(cell.modbus_port) as plc:
         cell.wait(cell.ready, "ready")
         assert cell.cycle().status_code == 200
         kill(gige, 1)
-        reader = threading.Thread(target=latencies_ms, args=(plc, stop, reads.append), name="controller")
+        reader = threading.Thread(target=latencies_ms, args=(plc, stop, reads.append, clock), name="controller")
         reader.start()
         try:
-            failed = time.monotonic()
+            failed = clock()
             assert cell.cycle().json()["code"] == CAMERAS       # its trigger leaves a thread in the driver for 2.5 s
-            assert time.monotonic() - failed < 2
-            while time.monotonic() - failed < 6:                # and its farewell another 2.5 s, beside attempts to reopen
-                asked = time.monotonic()
+            assert clock() - failed < 2
+            while clock() - failed < 6:         # and its farewell another 2.5 s, beside attempts to reopen
+                asked = clock()
                 [reason] = camera_reasons(cell)
                 assert reason.startswith("camera right is down: ")
                 assert "left" not in reason
-                assert time.monotonic() - asked < 1
+                assert clock() - asked < 1
                 time.sleep(0.05)
         finally:
             stop.set()
@@ -360,14 +362,15 @@ def test_one_killed_is_named_alone_and_its_stuck_thread_delays_nobody(tmp_path: 
         ends_well(cell)                       # with both threads in the driver
 
 
-def test_a_killed_daemons_cameras_are_taken_over_when_they_let_go(tmp_path: Path, gige: GigePair) -> None:
-    with daemon(tmp_path, gige, "rest", HELD_MS) as first:
+def test_a_killed_daemons_cameras_are_taken_over_when_they_let_go(tmp_path: Path, gige: GigePair,
+                                                                  clock: Callable[[], float]) -> None:
+    with daemon(tmp_path, gige, "rest", clock, HELD_MS) as first:
         first.wait(first.ready, "ready")
         with started(first):
             os.killpg(first.process.pid, signal.SIGKILL)
             killed = time.monotonic()
             first.process.wait()
-    with daemon(tmp_path, gige, "rest") as second:
+    with daemon(tmp_path, gige, "rest", clock) as second:
         second.wait(lambda: len(camera_reasons(second)) == 2, "refused by both cameras")
         assert time.monotonic() - killed < HELD_MS / 1000
         assert all("controlled by another program" in reason for reason in camera_reasons(second))

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
@@ -54,7 +54,8 @@ def page() -> Iterator[Page]:
         browser.close()
 
 
-def test_shows_ready_then_the_result_and_ends_with_the_daemon(daemon: tuple[subprocess.Popen[str], str], page: Page) -> None:
+def test_shows_ready_then_the_result_and_ends_with_the_daemon(daemon: tuple[subprocess.Popen[str], str], page: Page,
+                                                              clock: Callable[[], float]) -> None:
     process, url = daemon
     asked, failed = [], []
     page.on("request", lambda request: asked.append(request.url))
@@ -81,8 +82,8 @@ def test_shows_ready_then_the_result_and_ends_with_the_daemon(daemon: tuple[subp
     assert [address for address in asked if not address.startswith(url)] == []
     assert any("/v1/cycles/1/overlay.png" in address for address in asked)
 
-    stopped = time.monotonic()
+    stopped = clock()
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 0
-    assert time.monotonic() - stopped < 3
+    assert clock() - stopped < 3
     expect(page.locator("header b")).to_have_text("STOPPING")

@@ -1,13 +1,14 @@
-"""A pair is refused unless it is one: skew, missing packets, old frames, sizes; and failures name their camera."""
+"""A pair is refused unless it is one: skew, missing packets, old frames, sizes; and failures name their camera, in time."""
 
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Literal
 
 import numpy as np
 import pytest
 
-from binpick.camera.base import MonotonicNs
+from binpick.camera.base import Clock, MonotonicNs
 from binpick.camera.group import CameraGroup
 from binpick.data import CameraStatus, Frame, Image, Light
 from binpick.errors import CameraError, CameraLost, CycleTimeout, PairRefused
@@ -51,9 +52,9 @@ class Odd(SimCamera):
         return replace(super().status(), clock=self.clock)
 
 
-def grouped(left: SimCamera, right: SimCamera, max_skew_us: float = 500.0) -> CameraGroup:
-    group = CameraGroup((left, right), max_skew_us, wall_clock=lambda: datetime(2026, 1, 2, tzinfo=UTC))
-    group.open(within(1))
+def grouped(left: SimCamera, right: SimCamera, max_skew_us: float = 500.0, clock: Clock = time.monotonic_ns) -> CameraGroup:
+    group = CameraGroup((left, right), max_skew_us, clock, wall_clock=lambda: datetime(2026, 1, 2, tzinfo=UTC))
+    group.open(clock() + 10**9)
     return group
 
 
@@ -66,6 +67,38 @@ class Late(Odd):
         frame = super().grab(sequence, deadline_ns)
         self.late -= 1
         return replace(frame, timestamp_ns=9_000_000 if self.late >= 0 else 0)
+
+
+class Time:
+    """Passes while a camera waits."""
+
+    now = 5 * 10**9
+
+    def clock(self) -> MonotonicNs:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += int(seconds * 1e9)
+
+
+class Torn(SimCamera):
+    """Its first `torn` images lack packets, which shows 0.55 s after the trigger; `fate` is what becomes of it then."""
+
+    def __init__(self, index: int, time: Time, torn: int = 0, fate: Literal["", "stuck"] = "") -> None:
+        super().__init__(index, lambda *_: image_of(), time.clock, time.sleep)
+        self.time, self.torn, self.fate = time, torn, fate
+        self.shots = self.triggered_ns = 0
+
+    def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+        super().trigger(sequence, deadline_ns)
+        self.shots, self.triggered_ns = self.shots + 1, self.time.now
+
+    def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+        if self.shots > self.torn:
+            return super().grab(sequence, deadline_ns)
+        self.time.now = max(self.time.now, self.triggered_ns + 550_000_000)
+        self.fail = self.fate
+        raise PairRefused(f"{self.name}: incomplete", self.name)
 
 
 def test_on_one_clock_the_time_stamps_tell_the_skew() -> None:
@@ -92,6 +125,33 @@ def test_a_skewed_pair_is_shot_again() -> None:
     assert (pair.skew_us, pair.left.sequence, pair.right.sequence) == (0.0, 3, 3)
 
 
+@pytest.mark.parametrize(("left", "right"), [(1, 0), (0, 2), (2, 1)])
+def test_an_incomplete_image_is_shot_again_and_closes_nothing(left: int, right: int) -> None:
+    time = Time()
+    group = grouped(Torn(0, time, left), Torn(1, time, right), clock=time.clock)
+    pair = group.capture(LIGHT, time.now + 10**10)
+    assert pair.left.sequence == pair.right.sequence == 1 + max(left, right)
+    assert [(status.connected, status.error) for status in group.statuses()] == [(True, "")] * 2
+
+
+def test_images_that_stay_incomplete_are_refused_after_three_shots() -> None:
+    time = Time()
+    left, right = Torn(0, time, 3), Torn(1, time, 3)
+    group = grouped(left, right, clock=time.clock)
+    with pytest.raises(PairRefused, match="left: incomplete; right: incomplete"):
+        group.capture(LIGHT, time.now + 10**10)
+    assert (left.shots, right.shots) == (3, 3)
+    assert group.capture(LIGHT, time.now + 10**10).left.sequence == 4
+
+
+def test_nothing_is_shot_again_beyond_the_deadline() -> None:
+    time = Time()
+    left = Torn(0, time, 3)
+    with pytest.raises(CycleTimeout):
+        grouped(left, Torn(1, time), clock=time.clock).capture(LIGHT, time.now + 10**9)
+    assert left.shots == 2
+
+
 def test_a_numbered_pattern_is_not_shot_again() -> None:
     left, right = Odd(0), Late(1)
     right.late = 1
@@ -99,6 +159,11 @@ def test_a_numbered_pattern_is_not_shot_again() -> None:
     with pytest.raises(PairRefused, match="9000 µs apart"):
         group.capture(replace(LIGHT, pattern=9), within(2))
     assert group.capture(replace(LIGHT, pattern=9), within(2)).left.sequence == 2
+    time = Time()
+    group = grouped(Torn(0, time, 1), Torn(1, time), clock=time.clock)
+    with pytest.raises(PairRefused, match="left: incomplete"):
+        group.capture(replace(LIGHT, pattern=9), time.now + 10**10)
+    assert group.capture(replace(LIGHT, pattern=9), time.now + 10**10).right.sequence == 2
 
 
 def test_a_skew_that_stays_is_refused() -> None:
@@ -138,18 +203,21 @@ def test_light_is_set_when_it_changes_and_after_opening() -> None:
     assert (left.opened, right.opened) == (1, 2)
 
 
-def test_both_dead_cameras_stand_in_one_error() -> None:
-    left, right = SimCamera(0, lambda *_: image_of()), SimCamera(1, lambda *_: image_of())
-    group = grouped(left, right)
-    left.fail = right.fail = "stuck"
-    start = time.monotonic()
+@pytest.mark.parametrize("torn", [0, 1], ids=["at once", "in mid-image"])
+def test_both_dead_cameras_stand_in_one_error_within_the_exposure_and_1_4_s(torn: int) -> None:
+    time = Time()
+    left, right = Torn(0, time, torn, "stuck"), Torn(1, time, torn, "stuck")
+    group = grouped(left, right, clock=time.clock)
+    if not torn:
+        left.fail = right.fail = "stuck"
+    start = time.now
     with pytest.raises(CameraLost, match="left camera did not answer in time; the right camera did not") as caught:
-        group.capture(LIGHT, within(30))
-    assert time.monotonic() - start < 2
+        group.capture(LIGHT, start + 30 * 10**9)
+    assert time.now - start < 1_400_000_000
     assert caught.value.camera == ""
     assert all(status.error and not status.connected for status in group.statuses())
     with pytest.raises(CameraError, match=r"left.*right"):
-        group.capture(LIGHT, within(30))
+        group.capture(LIGHT, start + 30 * 10**9)
     group.close()
 
 

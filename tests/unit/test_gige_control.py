@@ -20,7 +20,7 @@ class Bench:
     def __init__(self) -> None:
         self.registers = Registers("127.0.9.2", 640, 400, "S1")
         self.written: list[str] = []
-        self.resends: list[tuple[int, int, int]] = []
+        self.resends: list[tuple[int, int, int, int]] = []
         self.releases = 0
         self.control = Control(self.registers, lambda name, _at: self.written.append(name),
                                lambda *request: self.resends.append(request), self._released)
@@ -105,13 +105,22 @@ def test_refused_writes_change_nothing(bench: Bench, address: int, value: int, s
     assert (bench.registers.read(HEARTBEAT, 4), bench.registers.read(VENDOR, 32)) == before
 
 
+def test_a_repeated_command_is_acknowledged_again_and_not_carried_out_again(bench: Bench) -> None:
+    bench.write(CCP, 2)
+    request = struct.pack(">II", HEARTBEAT, 2000)
+    first = bench.ask(Code.WRITEREG, request)
+    bench.ask(Code.PACKETRESEND, struct.pack(">HHII", 0, 5, 17, 20), flags=0)      # the stream's own, meanwhile
+    assert bench.ask(Code.WRITEREG, request) == first
+    assert bench.written == ["GevCCP", "GevHeartbeatTimeout"]
+
+
 def test_resend_requests_count_for_the_controllers_host_only(bench: Bench) -> None:
     request = struct.pack(">HHII", 0, 5, 17, 20)
     assert bench.ask(Code.PACKETRESEND, request) is None
     bench.write(CCP, 2)
     assert bench.ask(Code.PACKETRESEND, request, (OWNER[0], 6001), flags=0) is None
     assert bench.ask(Code.PACKETRESEND, request, OTHER, flags=0) is None
-    assert bench.resends == [(5, 17, 20)]
+    assert bench.resends == [(5, 17, 20, 0)]
 
 
 def test_an_unknown_command_is_refused_and_noise_is_not_answered(bench: Bench) -> None:

@@ -15,7 +15,8 @@ class Camera(Protocol):
     """One triggered camera, called by one thread at a time.
 
     No verb may block beyond `deadline_ns` (host monotonic clock), whatever the camera or its driver does; a verb that cannot
-    end by then raises CameraLost. After an error the camera is closed and opened again by its caller.
+    end by then raises CameraLost. After an error the camera is closed and opened again by its caller, except after PairRefused:
+    that is one image's affair.
     """
 
     @property

@@ -1,5 +1,7 @@
 """Two cameras as one instrument: one light, one trigger, and a pair only when both images are proved to show one instant."""
 
+import contextlib
+import logging
 import math
 import time
 from collections.abc import Callable
@@ -12,16 +14,21 @@ from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import CameraError, Code, CycleTimeout, PairRefused
 
 T = TypeVar("T")
-COMMAND_NS = 600_000_000
-"""Longest wait for a command's acknowledge; a lost datagram is repeated after 500 ms."""
+COMMAND_NS = 1_000_000_000
+"""Longest wait for a command's acknowledge: a lost datagram is repeated after 500 ms, and a host may stall as long."""
+AGAIN_NS = 550_000_000
+"""The same for a shot that is made again: a camera that died in mid-image is found out by it, after what the driver waited for
+the rest of that image (RETENTION_US)."""
 IMAGE_NS = 1_000_000_000
 """Longest wait for an image after its exposure."""
 SECOND_NS = 150_000_000
-"""What is left at least to fetch the second image, when waiting for the first has used up the time."""
+"""What is left at least for the second camera, when waiting for the first has used up the time."""
 TRIES = 3
 """Shots for one pair; one of a projector's numbered patterns has a single one, since its next strobe shows the next pattern."""
 CLOCK_SIGMA_US = 1.0
 """Of time stamps on one clock: what PTP reaches on one switch."""
+
+log = logging.getLogger(__name__)
 
 
 class CameraGroup:
@@ -46,32 +53,36 @@ class CameraGroup:
     def capture(self, light: Light, deadline_ns: MonotonicNs) -> StereoPair:
         """One pair. Raises CameraError naming every camera that failed, PairRefused when two images are no pair.
 
-        Two software triggers come too far apart when the host was busy between them: then it tries again, up to three times
-        in all (a numbered pattern's shot has one try). A dead camera is noticed within the exposure and 1.4 s, whatever the
-        deadline is, and stays closed until `open`.
+        Two software triggers come too far apart, or an image incomplete, when the host was busy meanwhile: then it tries
+        again, up to three times in all (a numbered pattern's shot has one try), and the cameras stay open. A dead camera is
+        noticed within the exposure and 1.4 s, whatever the deadline is, and stays closed until `open`.
         The deadline ends no exposure that has begun, since a healthy camera is not to be blamed for a short one: it is looked
         at between the steps. Raises CycleTimeout then.
         """
         self._each(lambda i, camera: self._require_open(i, camera))
         # one whose shot the other's failure broke off may still expose, and would miss its next trigger
-        self._each(lambda i, camera: self._due[i] and self._fetch(i, camera))
+        with contextlib.suppress(PairRefused):       # nobody wants that image
+            self._each(lambda i, camera: self._due[i] and self._fetch(i, camera))
         self._configure(light)
-        for _ in range(1 if light.pattern else TRIES):
+        tries, patience_ns = 1 if light.pattern else TRIES, COMMAND_NS
+        while True:
             if self._clock() >= deadline_ns:
                 raise CycleTimeout(Code.TIMEOUT.message)
-            pair = self._shoot(light)
-            if abs(pair.skew_us) <= self._max_skew_us:
-                return pair
-        raise PairRefused(f"the images were exposed {abs(pair.skew_us):.0f} µs apart ({pair.proof}), more than the "
-                          f"{self._max_skew_us:.0f} µs allowed (max_skew_us)")
+            try:
+                return self._shoot(light, patience_ns)
+            except PairRefused as refusal:
+                tries, patience_ns = tries - 1, AGAIN_NS
+                if not tries:
+                    raise
+                log.info("shooting again: %s", refusal)
 
-    def _shoot(self, light: Light) -> StereoPair:
+    def _shoot(self, light: Light, patience_ns: int) -> StereoPair:
         self._sequence += 1
         captured_at = self._wall_clock().isoformat(timespec="milliseconds")
         ticks = [self._clock()]
 
         def trigger(index: int, camera: Camera) -> None:
-            camera.trigger(self._sequence, self._clock() + COMMAND_NS)
+            camera.trigger(self._sequence, self._answer_by(patience_ns))
             ticks.append(self._clock())
             self._due[index] = ticks[-1] + int(light.exposure_us * 1000) + IMAGE_NS
 
@@ -83,12 +94,19 @@ class CameraGroup:
         if left.image.shape != right.image.shape:
             raise PairRefused(f"the images differ in size: left {_size(left)}, right {_size(right)} pixels")
         skew_us, sigma_us, proof = self._skew(left, right, ticks)
+        if abs(skew_us) > self._max_skew_us:
+            raise PairRefused(f"the images were exposed {abs(skew_us):.0f} µs apart ({proof}), more than the "
+                              f"{self._max_skew_us:.0f} µs allowed (max_skew_us)")
         return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew_us, sigma_us=sigma_us, proof=proof)
 
     def _fetch(self, index: int, camera: Camera) -> Frame:
         """The image of its last trigger."""
         limit, self._due[index] = max(self._due[index] or 0, self._clock() + SECOND_NS), None
         return camera.grab(self._sequence, limit)
+
+    def _answer_by(self, patience_ns: int) -> MonotonicNs:
+        """Once one camera has failed, the other is only asked whether it lives: it is to be named as well if it does not."""
+        return self._clock() + (patience_ns if all(self._open) else SECOND_NS)
 
     def close(self) -> None:
         """Closes both, at most 1 s each; never raises."""
@@ -112,19 +130,20 @@ class CameraGroup:
     def _configure(self, light: Light) -> None:
         wanted = (light.exposure_us, light.gain_db, light.projector, light.pattern)
         if wanted != self._light:
-            self._each(lambda _, camera: camera.configure(light, self._clock() + COMMAND_NS))
+            self._each(lambda _, camera: camera.configure(light, self._answer_by(COMMAND_NS)))
             self._light = wanted
 
     def _each(self, verb: Callable[[int, Camera], T]) -> list[T]:
-        """The verb's answers of both cameras; those that fail are closed, and named in one error."""
+        """The verb's answers of both; cameras that fail are named in one error and closed: not for an incomplete image."""
         answers, broken = [], []
         for index, camera in enumerate(self._cameras):
             try:
                 answers.append(verb(index, camera))
             except CameraError as error:
-                camera.close()
-                self._open[index], self._errors[index], self._light = False, str(error), None
                 broken.append(error)
+                if not isinstance(error, PairRefused):
+                    camera.close()
+                    self._open[index], self._errors[index], self._light = False, str(error), None
         if len(broken) == 1:
             raise broken[0]
         if broken:

@@ -9,7 +9,7 @@ from binpick.camera.aravis.driver import Driver
 from binpick.camera.base import MonotonicNs, remaining_s
 from binpick.camera.owner import Owner
 from binpick.data import CameraStatus, Frame, Light
-from binpick.errors import CameraError, CameraLost, CameraNotFound
+from binpick.errors import CameraError, CameraLost, CameraNotFound, PairRefused
 
 T = TypeVar("T")
 HANDOVER_S = 1.5
@@ -20,7 +20,7 @@ class AravisCamera:
     """One camera, by address (opened without discovery) or by serial number; with both, the serial is checked.
 
     Its thread `binpick-cam-<name>` alone touches Aravis' objects. A verb that cannot end by its deadline raises CameraLost and
-    leaves that thread behind; the next `open` starts another.
+    leaves that thread behind; the next `open` starts another. An incomplete image counts as a failure, but closes nothing.
     """
 
     def __init__(self, name: str, address: str, serial: str, packet_size: int = 1500, heartbeat_ms: int = 3000) -> None:
@@ -72,12 +72,12 @@ class AravisCamera:
         return frame
 
     def close(self) -> None:
-        """Gives the camera back; at most 0.9 s, and 0.1 s for one that failed, since that may take its thread long."""
+        """Gives the camera back; at most 0.9 s, and 0.05 s for one that failed, since that may take its thread long."""
         if self._owner is not None:
             self._owner.retire()
             self._owner.join(0.9)
         elif self._retired is not None:
-            self._retired.join(0.1)
+            self._retired.join(0.05)
         self._owner = self._driver = None
         self._status = replace(self._status, connected=False)
 
@@ -98,6 +98,9 @@ class AravisCamera:
         except TimeoutError:
             raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}: check its power, cable and "
                                         "network", self._name)) from None
+        except PairRefused:
+            self._status = replace(self._status, failures=self._status.failures + 1)
+            raise
         except CameraError as error:
             raise self._fail(error) from None
 

@@ -26,10 +26,11 @@ PACKET_TIMEOUT_US = 10_000
 """When a missing packet is asked for again. Aravis' 20 ms dominates the latency of a lossy link; at 5 ms a sender that was
 merely held up for a moment is asked for the rest of its frame."""
 REQUEST_RATIO = 2.0
-"""Requests allowed for a frame, as a multiple of its packets. With Aravis' 0.25 one such moment used them up, and what was lost
-later stayed lost (measured: 3 of 60 pairs at 2 % loss)."""
-RETENTION_US = 400_000
-"""How long an incomplete frame may wait for its packets, beyond the exposure."""
+"""The largest request, as a multiple of a frame's packets: of any size. With Aravis' 0.25 a request for the rest of a frame, as
+after such a moment, was its last: what was lost later stayed lost (measured: 3 of 60 pairs at 2 % loss)."""
+RETENTION_US = 550_000
+"""How long an incomplete frame may wait for its next packet, beyond the exposure: longer than a sender that stalls for half a
+second, and short enough for the group to find out in time that the camera has died."""
 POP_MARGIN_S = 0.05
 """The driver gives up this much before its caller does, so that the thread is free again."""
 PROJECTOR_LINE = "Line2"
@@ -146,6 +147,7 @@ class Driver:
     def trigger(self) -> None:
         """Sends it; the camera's acknowledge has come when this returns."""
         _, glib = _library()
+        self._discard()
         self._triggers += 1
         self._counted = self._count("n_resent_packets"), self._count("n_missing_packets")
         self._triggered_ns = time.monotonic_ns()
@@ -154,8 +156,19 @@ class Driver:
         except glib.Error as error:
             raise self._translated(error, "triggering") from None
 
+    def _discard(self) -> None:
+        """Images that nobody fetched. Raises CameraLost when there is one without a trigger."""
+        while (buffer := self._stream.try_pop_buffer()) is not None:
+            whole, frame_id = self._whole(buffer), buffer.get_frame_id()
+            self._stream.push_buffer(buffer)
+            if whole:
+                self._behind(frame_id)
+
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> tuple[Frame, str]:
-        """The frame of the last trigger and the name of the clock it is stamped by; frames of older triggers are dropped."""
+        """The frame of the last trigger and the name of the clock it is stamped by; frames of older triggers are dropped.
+
+        Raises PairRefused for an incomplete one: it may lack the packet with its number, but nobody waits for older ones.
+        """
         stream = self._stream
         while True:
             buffer = stream.timeout_pop_buffer(int(max(0.0, remaining_s(deadline_ns) - POP_MARGIN_S) * 1e6))
@@ -163,32 +176,44 @@ class Driver:
                 raise CameraLost(f"camera {self._name} took the trigger but sent no image: check its power, cable and network",
                                  self._name)
             try:
+                if not self._whole(buffer):
+                    raise PairRefused(f"camera {self._name}: the image came incomplete ({buffer.get_status().value_nick}, "
+                                      f"{self._missing()} packets missing): check cable, network card and socket buffer",
+                                      self._name)
                 if self._behind(buffer.get_frame_id()) == 0:
                     return self._frame(buffer, sequence), self._clock()
             finally:
                 stream.push_buffer(buffer)
 
     def _behind(self, frame_id: int) -> int:
-        """How many triggers older than the last one a frame is; the first frame after opening says where counting starts."""
+        """How many triggers older than the last one a frame is; the first frame after opening says where counting starts.
+
+        Raises CameraLost for one that no trigger asked for: counted on, every later image would be taken for a newer one.
+        """
         if self._triggers == 1:
             self._first_id = frame_id
-        return (self._first_id + self._triggers - 1 - frame_id) % BLOCK_IDS
+        behind = (self._first_id + self._triggers - 1 - frame_id) % BLOCK_IDS
+        if behind > BLOCK_IDS // 2:
+            raise CameraLost(f"camera {self._name} sent an image that it was not triggered for: it is opened again", self._name)
+        return behind
+
+    def _whole(self, buffer: Any) -> bool:
+        aravis, _ = _library()
+        return bool(buffer.get_status() == aravis.BufferStatus.SUCCESS)
 
     def _frame(self, buffer: Any, sequence: int) -> Frame:
-        aravis, _ = _library()
         resends = self._count("n_resent_packets") - self._counted[0]
-        missing = self._count("n_missing_packets") - self._counted[1]
-        status = buffer.get_status()
-        if status != aravis.BufferStatus.SUCCESS:
-            raise PairRefused(f"camera {self._name}: the image came incomplete ({status.value_nick}, {missing} packets "
-                              "missing): check cable, network card and socket buffer", self._name)
         height, width = buffer.get_image_height(), buffer.get_image_width()
         # get_data() copies once; the bytes are the frame's own
         image = np.frombuffer(buffer.get_data(), np.uint8, count=height * width).reshape(height, width)
         return Frame(image=image, camera=self._name, sequence=sequence, frame_id=int(buffer.get_frame_id()),
                      timestamp_ns=int(buffer.get_timestamp()), triggered_ns=self._triggered_ns,
                      received_ns=time.monotonic_ns(), exposure_us=self._exposure_us, gain_db=self._gain_db,
-                     resends=resends, missing=missing)
+                     resends=resends, missing=self._missing())
+
+    def _missing(self) -> int:
+        """Packets lost since the last trigger."""
+        return self._count("n_missing_packets") - self._counted[1]
 
     def _count(self, name: str) -> int:
         return int(self._stream.get_info_uint64_by_name(name))

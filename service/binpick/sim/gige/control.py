@@ -12,18 +12,20 @@ Peer = tuple[str, int]
 class Control:
     """Answers datagrams; reading is free, writing is for the one peer that took control and keeps talking.
 
-    `written(feature, arrived_ns)` is called after every successful write, `resend(block, first, last)` when the controller's
-    host asks for packets again, `released()` when control ends.
+    A datagram that comes twice, since its sender missed the acknowledge, is acknowledged again and not carried out again.
+    `written(feature, arrived_ns)` is called after every successful write, `resend(block, first, last, arrived_ns)` when
+    the controller's host asks for packets again, `released()` when control ends.
     """
 
     def __init__(self, registers: Registers, written: Callable[[str, int], None],
-                 resend: Callable[[int, int, int], None], released: Callable[[], None]) -> None:
+                 resend: Callable[[int, int, int, int], None], released: Callable[[], None]) -> None:
         self._registers = registers
         self._written = written
         self._resend = resend
         self._released = released
         self._controller: Peer | None = None
         self._heard_ns = 0
+        self._last: tuple[bytes, Peer, bytes] = (b"", ("", 0), b"")
 
     def answer(self, datagram: bytes, peer: Peer, arrived_ns: int) -> bytes | None:
         """The acknowledge, or None when there is nothing to say."""
@@ -32,6 +34,14 @@ class Control:
             return None
         if peer == self._controller:
             self._heard_ns = arrived_ns
+        if self._last[:2] == (datagram, peer):
+            return self._last[2]
+        reply = self._carry_out(command, peer, arrived_ns)
+        if reply is not None:
+            self._last = datagram, peer, reply
+        return reply
+
+    def _carry_out(self, command: Command, peer: Peer, arrived_ns: int) -> bytes | None:
         try:
             payload = self._execute(command, peer, arrived_ns)
         except Fault as fault:
@@ -71,7 +81,7 @@ class Control:
             case Code.PACKETRESEND:
                 if self._controller and self._controller[0] == peer[0]:
                     _channel, block, first, last = _exactly(">HHII", command.payload)
-                    self._resend(block, first & 0xFFFFFF, last & 0xFFFFFF)
+                    self._resend(block, first & 0xFFFFFF, last & 0xFFFFFF, arrived_ns)
                 return None
         raise Fault(Status.NOT_IMPLEMENTED)
 

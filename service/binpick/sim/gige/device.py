@@ -4,6 +4,7 @@ import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,6 +23,10 @@ LINK_BITS_PER_S = 2e9
 SO_TIMESTAMPNS = 35
 """The socket option of asm-generic/socket.h, which Python does not name: when did the datagram arrive?"""
 POLL_S = 0.1
+REQUESTS = 4096
+"""For packets to be sent again: on a bad link they come in floods, and commands go before them."""
+CONTROL_BYTES = 4 << 20
+"""What may wait at the control socket; the kernel clips it to net.core.rmem_max."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +115,14 @@ class Device:
                 self._socket.sendto(reply, peer)
 
     def _serve(self) -> None:
+        requests: deque[tuple[bytes, Peer, int]] = deque(maxlen=REQUESTS)
         while not self._off.is_set():
             try:
+                self._socket.settimeout(0 if requests else POLL_S)
                 datagram, ancillary, _flags, peer = self._socket.recvmsg(2048, 64)
+            except BlockingIOError:
+                self.receive(*requests.popleft())
+                continue
             except TimeoutError:
                 self._control.expire(device_clock_ns())
                 continue
@@ -121,7 +131,9 @@ class Device:
                     return
                 raise
             self._control.expire(device_clock_ns())
-            if datagram:
+            if gvcp.is_resend(datagram):
+                requests.append((datagram, peer, _arrival_ns(ancillary)))
+            elif datagram:
                 self.receive(datagram, peer, _arrival_ns(ancillary))
 
     def _written(self, feature: str, arrived_ns: int) -> None:
@@ -131,7 +143,7 @@ class Device:
             case "AcquisitionStop":
                 self._stop_acquisition()
             case "TriggerSoftware":
-                self._trigger(arrived_ns)
+                self.trigger(arrived_ns)
             case "GevTimestampControlLatch":
                 self.registers.set("GevTimestampValue", device_clock_ns())
             case "PtpEnable":
@@ -147,9 +159,9 @@ class Device:
         return (socket.inet_ntoa(self.registers.integer("GevSCDA").to_bytes(4, "big")),
                 self.registers.integer("GevSCPHostPort"))
 
-    def _resend(self, block: int, first: int, last: int) -> None:
+    def _resend(self, block: int, first: int, last: int, arrived_ns: int) -> None:
         with suppress(OSError):
-            self.sender.resend(self._target(), block, first, last)
+            self.sender.resend(self._target(), block, first, last, arrived_ns)
 
     def _start_acquisition(self) -> None:
         with self._state:
@@ -160,7 +172,8 @@ class Device:
         with self._state:
             self._acquiring, self._pending = False, None
 
-    def _trigger(self, arrived_ns: int) -> None:
+    def trigger(self, arrived_ns: int) -> None:
+        """Starts one exposure, if it is ready for one."""
         read = self.registers.integer
         with self._state:
             ready = self._acquiring and self._pending is None and read("TriggerMode") == 1
@@ -205,7 +218,7 @@ class Device:
 def _control_socket(address: str) -> socket.socket:
     control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     control.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    control.settimeout(POLL_S)
+    control.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, CONTROL_BYTES)
     try:
         control.bind((address, gvcp.PORT))
     except OSError:

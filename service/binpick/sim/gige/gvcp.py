@@ -66,6 +66,11 @@ def parse(datagram: bytes) -> Command | None:
     return Command(code, flags, number, payload)
 
 
+def is_resend(datagram: bytes) -> bool:
+    """Whether it asks for packets to be sent again, without taking it apart."""
+    return datagram[2:4] == Code.PACKETRESEND.to_bytes(2, "big")
+
+
 def acknowledge(command: Command, payload: bytes) -> bytes:
     """The datagram of success."""
     return struct.pack(">HHHH", 0, command.code + 1, len(payload), command.number) + payload

@@ -29,7 +29,7 @@ class GigePair:
         width, height = size_px
         self.identities = tuple(Identity(i, NAMES[i], addresses[i], serials[i], width, height) for i in (0, 1))
         self._devices: dict[int, Device] = {}
-        self._loss = (0.0, 0)
+        self._loss = (0.0, 0, True)
         self._stop = threading.Event()
         self._discovery: threading.Thread | None = None
 
@@ -85,11 +85,15 @@ class GigePair:
         """It still answers, but its images stay away until it is restarted."""
         self._devices[index].frozen = True
 
-    def drop_packets(self, fraction: float, seed: int) -> None:
-        """Both lose that share of their stream packets from now on, resent ones included; 0 ends it."""
-        self._loss = (fraction, seed)
+    def misfire(self, index: int) -> None:
+        """It exposes once without having been asked."""
+        self._devices[index].trigger(device_clock_ns())
+
+    def drop_packets(self, fraction: float, seed: int, resends: bool = True) -> None:
+        """Both lose that share of their stream packets from now on, resent ones included, or send none again; 0 ends it."""
+        self._loss = (fraction, seed, resends)
         for index, device in self._devices.items():
-            device.sender.drop(fraction, seed + index)
+            device.sender.drop(fraction, seed + index, resends)
 
     def resent(self, index: int) -> int:
         """Packets it was asked for again since power-up."""
