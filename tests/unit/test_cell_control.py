@@ -134,10 +134,11 @@ def released() -> TestCameras:
 
 def test_a_cycle_is_captured_computed_and_published() -> None:
     async def scenario() -> None:
-        cameras = released()
+        cameras = TestCameras()
         async with living(cameras) as cell:
             cycle_id = cell.start(Request(request_id="mine"), "rest")
             assert cell.snapshot().current == cycle_id == 1
+            cameras.gate.set()
             shown = await until(cell, lambda s: s.valid)
             assert shown.phase == "ready"
             assert shown.published is not None
