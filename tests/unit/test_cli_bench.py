@@ -20,27 +20,32 @@ def test_the_whole_exam_keeps_its_options_and_names_its_parts(monkeypatch, capsy
     assert call(monkeypatch, "--help") == 0
     says = capsys.readouterr().out
     assert "exam" in says
+    assert "grasp" in says
     assert "stereo" in says
     assert call(monkeypatch, "exam", "--help") == 0
     says = capsys.readouterr().out
-    for word in ("--world", "--scenes", "--cycles", "--textbook", "--tuning", "--tool", "--kinds", "--modbus", "--json"):
+    for word in ("--world", "--scenes", "--cycles", "--textbook", "--tuning", "--modbus", "--json"):
         assert word in says
     assert call(monkeypatch, "--modbus", "here") == call(monkeypatch, "exam", "--modbus", "here") == 2
     assert capsys.readouterr().err.count("HOST:PORT") == 2
 
 
-def test_the_stereo_part_has_its_own(monkeypatch, capsys):
+@pytest.mark.parametrize(("part", "options"), [
+    ("stereo", ("--world", "--scenes", "--tuning", "--repeats", "--middlebury", "--out", "--json")),
+    ("grasp", ("--world", "--scenes", "--parts", "--tuning", "--json")),
+])
+def test_the_other_parts_have_their_own(monkeypatch, capsys, part, options):
     monkeypatch.setenv("COLUMNS", "200")
-    assert call(monkeypatch, "stereo", "--help") == 0
+    assert call(monkeypatch, part, "--help") == 0
     says = capsys.readouterr().out
-    for word in ("--world", "--scenes", "--tuning", "--repeats", "--middlebury", "--out", "--json"):
+    for word in options:
         assert word in says
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
     (("--tuning", "stereo"), "unexpected extra argument"),
     (("stereo", "--world", "C"), "A, B and all"),
-    (("--tool", "hook"), "there are suction and two_finger"),
+    (("grasp", "--world", "C"), "no exam world 'C'"),
     (("stereo", "--middlebury", "nowhere"), "no Middlebury scenes"),
 ])
 def test_what_cannot_be_is_one_line(monkeypatch, capsys, arguments, says):

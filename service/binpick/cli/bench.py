@@ -32,12 +32,10 @@ def exam(
     cycles: Annotated[int, typer.Option(help="Timed cycles per scene.", min=1, max=100)] = 2,
     textbook: Annotated[bool, typer.Option(help="Also run the textbook pipeline (6 s a cycle).")] = True,
     tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
-    tool: Annotated[str, typer.Option(help="suction or two_finger; the textbook knows suction only.")] = "suction",
-    kinds: Annotated[str, typer.Option(help="The parts: mixed, metal, one kind, or several as in block+tee.")] = "mixed",
     modbus: Annotated[str, typer.Option(metavar="HOST:PORT", help="Time a daemon's Modbus reads instead (20 s).")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Sit the exam: depth, first grasps and times against the simulator's ground truth."""
+    """Sit the exam, mixed parts and suction: depth, first grasps and times against the simulator's ground truth."""
     import json
 
     if modbus:
@@ -46,20 +44,45 @@ def exam(
     from rich.console import Console
     from rich.progress import track
 
-    from binpick.errors import InputError
     from binpick.lab import grasps, report
     from binpick.sim import exam as frozen
 
-    if tool not in ("suction", "two_finger"):
-        raise InputError(f"--tool {tool}: there are suction and two_finger")
     seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
-    sitting = grasps.sit(world, seeds, cycles, textbook and tool == "suction", kinds=kinds, tool=tool)
+    sitting = grasps.sit(world, seeds, cycles, textbook)
     done = list(track(sitting, "Sitting the exam", total=len(seeds), console=Console(stderr=True), transient=True))
-    run = report.figures(world, done, kinds, tool)
+    run = report.figures(world, done)
     if as_json:
         typer.echo(json.dumps(run, indent=1))
     else:
         Console(width=150).print(report.table(run))
+
+
+@bench.command()
+def grasp(
+    world: Annotated[str, typer.Option(help="Exam world: A (6 mm lens, 600x400 mm bin) or B (12 mm lens, 300x200 mm).")] = "A",
+    scenes: Annotated[int, typer.Option(help="How many seeds from 101, or with --tuning from 1.", min=1, max=10)] = 10,
+    parts: Annotated[int, typer.Option(help="Parts per bin.", min=1, max=100)] = 25,
+    tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """First cycles over kinds of parts, per tool: grasps, segments, sigma and stages against the simulator's ground truth."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import track
+
+    from binpick.lab import picks, tally
+    from binpick.sim import exam as frozen
+
+    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
+    sitting = picks.sit(world, seeds, parts)
+    total = len(picks.MIXES) * len(seeds)
+    sheets = list(track(sitting, "Picking", total=total, console=Console(stderr=True), transient=True))
+    run = tally.figures(world, parts, sheets)
+    if as_json:
+        typer.echo(json.dumps(run, indent=1))
+    else:
+        Console(width=150).print(tally.tables(run))
 
 
 @bench.command()

@@ -1,9 +1,9 @@
 """The exam's frames: a settled world, the pair its cameras take, and the truth behind it, made once per scene."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
+from scipy.stats import binomtest
 
 from binpick import settings
 from binpick.data import Frame, Light, StereoPair, Window
@@ -43,19 +43,25 @@ def renderer(world: str) -> Renderer:
 
 
 def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin",
-          projector: bool | None = None, shots: tuple[Shot, ...] = (), tool: str = "suction") -> Paper:
+          projector: bool | None = None, shots: tuple[Shot, ...] = ()) -> Paper:
     """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame.
 
-    `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own; `tool` is the kind of the default tool.
+    `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own.
     """
     scene = World(world, kinds, parts, seed).scene()
-    job = settings.resolve(exam.cell(world, tools=[{"kind": tool}]), recipe)
+    job = settings.resolve(exam.cell(world), recipe)
     changes = ({} if projector is None else {"projector": projector}) | ({"shots": shots} if shots else {})
     if changes:
         job = job.model_copy(update={"recipe": Recipe.model_validate(job.recipe.model_dump() | changes)})
     first, *more = (pair(scene, light, seed + i) for i, light in enumerate(job.recipe.lights))
     request = Request.model_validate({"frame": frame})
     return Paper(CycleInput(1, first, exam.rig(world), job, request, simulated=True, more=tuple(more)), scene)
+
+
+def for_tool(asked: Paper, kind: str) -> Paper:
+    """The same frames for a cell whose one tool is the default of that kind."""
+    tools = exam.cell(asked.scene.world, tools=[{"kind": kind}]).tools
+    return replace(asked, inputs=replace(asked.inputs, job=asked.inputs.job.model_copy(update={"tools": tools})))
 
 
 def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:
@@ -78,10 +84,8 @@ def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:
 
 
 def wilson(good: int, of: int) -> tuple[float, float]:
-    """The 95 % Wilson score interval of a share (Wilson 1927)."""
+    """The 95 % Wilson score interval of a share (Wilson 1927); of nothing, 0 to 1."""
     if of == 0:
         return 0.0, 1.0
-    z, p = 1.959964, good / of
-    middle = (p + z * z / (2 * of)) / (1 + z * z / of)
-    half = z / (1 + z * z / of) * float(np.sqrt(p * (1 - p) / of + z * z / (4 * of * of)))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    low, high = binomtest(good, of).proportion_ci(method="wilson")
+    return float(low), float(high)

@@ -14,6 +14,7 @@ from binpick.lab.exam import Paper
 from binpick.lab.stereo import DepthScore
 from binpick.result import CycleResult, GraspMessage
 from binpick.sim import score
+from binpick.sim.score import Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,28 +55,22 @@ class Scene:
     textbook_window: Answer | None = None
 
 
-def sit(world: str, seeds: Iterable[int], cycles: int, against_textbook: bool, *, kinds: str = "mixed",
-        tool: str = "suction") -> Iterator[Scene]:
-    """Sits the exam, one scene at a time; `cycles` timed repetitions of ours, of which the median counts.
-
-    `kinds` and `tool` as in `exam.paper`; the textbook knows suction only.
-    """
+def sit(world: str, seeds: Iterable[int], cycles: int, against_textbook: bool) -> Iterator[Scene]:
+    """Sits the exam, one scene at a time; `cycles` timed repetitions of ours, of which the median counts."""
     for seed in seeds:
-        paper = exam.paper(world, seed, kinds=kinds, tool=tool)
+        paper = exam.paper(world, seed)
         outcome, seconds, stages = _ours(paper, cycles)
         if outcome.rectified is None or outcome.depth is None:
             raise RuntimeError("a settled world always has depth")
         view = outcome.rectified.window
         truth = paper.truth(view)
         on_part = truth.part_id > 0
-        good, depths = judged(paper, [_taken(grasp) for grasp in outcome.result.grasps])
-        ours = Answer(
-            stereo.score(outcome.depth.disparity, truth.disparity, on_part, truth.visible_both), good, depths, seconds
-        )
+        verdicts = judged(paper, [taken(grasp) for grasp in outcome.result.grasps])
+        depth = stereo.score(outcome.depth.disparity, truth.disparity, on_part, truth.visible_both)
         yield Scene(
             seed=seed,
             code=outcome.result.return_code.value,
-            ours=ours,
+            ours=_answer(depth, verdicts, seconds),
             stages_ms=stages,
             plain=stereo.score(stereo.plain_sgbm(outcome.rectified), truth.disparity, on_part, truth.visible_both),
             textbook=_textbook(paper, None) if against_textbook else None,
@@ -105,20 +100,23 @@ def _textbook(paper: Paper, view: Window | None) -> Answer:
     book = baseline.run(inputs.pair.left.image, inputs.pair.right.image, inputs.rig, T_camera_bin, inputs.job.bin, view)
     truth = paper.truth(book.window)
     disparity = np.where(book.disparity > 0, book.disparity, np.float32(np.nan)).astype(np.float32)
-    good, depths = judged(paper, [Taken(T_bin_tcp, inputs.job.tool.number) for T_bin_tcp in book.grasps[:5]])
+    verdicts = judged(paper, [Taken(T_bin_tcp, inputs.job.tool.number) for T_bin_tcp in book.grasps[:5]])
     depth = stereo.score(disparity, truth.disparity, truth.part_id > 0, truth.visible_both)
-    return Answer(depth, good, depths, (book.seconds["total"],))
+    return _answer(depth, verdicts, (book.seconds["total"],))
 
 
-def judged(paper: Paper, grasps: Sequence[Taken]) -> tuple[tuple[bool, ...], tuple[float, ...]]:
-    """The judge's verdict on each grasp, and how deep the tool would go into something, metres."""
+def _answer(depth: DepthScore, verdicts: Sequence[Verdict], seconds: tuple[float, ...]) -> Answer:
+    return Answer(depth, tuple(v.ok for v in verdicts), tuple(v.penetration_m for v in verdicts), seconds)
+
+
+def judged(paper: Paper, grasps: Sequence[Taken]) -> tuple[Verdict, ...]:
+    """The judge's verdict on each grasp."""
     job = paper.inputs.job
-    verdicts = [score.judge(paper.scene, grasp.T_bin_tcp, job.tool_numbered(grasp.tool), grasp.open_m, grasp.close_m)
-                for grasp in grasps]
-    return tuple(v.ok for v in verdicts), tuple(v.penetration_m for v in verdicts)
+    return tuple(score.judge(paper.scene, grasp.T_bin_tcp, job.tool_numbered(grasp.tool), grasp.open_m, grasp.close_m)
+                 for grasp in grasps)
 
 
-def _taken(grasp: GraspMessage) -> Taken:
+def taken(grasp: GraspMessage) -> Taken:
     """The published grasp; the exam asks for frame `bin`."""
     if grasp.frame != "bin":
         raise ValueError("the exam's papers are answered in the bin's frame")

@@ -1,4 +1,4 @@
-"""The bench as a table for people and as JSON for machines; every figure of the README comes from here."""
+"""The bench as a table for people and as JSON for machines; the exam of `binpick bench`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from binpick.sim import exam as tables
 from binpick.sim import score
 
 
-def figures(world: str, scenes: Sequence[Scene], kinds: str = "mixed", tool: str = "suction") -> dict[str, Any]:
+def figures(world: str, scenes: Sequence[Scene]) -> dict[str, Any]:
     """All figures of a run."""
     book = [s.textbook for s in scenes if s.textbook is not None]
     windowed = [s.textbook_window for s in scenes if s.textbook_window is not None]
@@ -25,8 +25,6 @@ def figures(world: str, scenes: Sequence[Scene], kinds: str = "mixed", tool: str
     return {
         "exam_sha256": tables.sha256(),
         "world": world,
-        "kinds": kinds,
-        "tool": tool,
         "seeds": [s.seed for s in scenes],
         "plain_sgbm": _depth([s.plain for s in scenes]),
         "rows": rows,
@@ -73,7 +71,7 @@ def table(run: dict[str, Any]) -> Group:
         "bad-2",
         "median |Δd|",
         "density",
-        title=f"Exam world {run['world']}, {run['kinds']}, {run['tool']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, "
+        title=f"Exam world {run['world']}, seeds {run['seeds'][0]} to {run['seeds'][-1]}, "
         f"tables {run['exam_sha256'][:12]}",
     )
     depth.add_row(

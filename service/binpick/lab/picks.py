@@ -1,0 +1,85 @@
+"""First cycles over kinds of parts, per tool: the judge's word on each grasp, and which parts are one segment."""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from binpick import pipeline
+from binpick.lab import exam, grasps, parts
+from binpick.lab.exam import Paper
+from binpick.lab.parts import PartScore
+from binpick.result import CycleResult
+
+KINDS = {"suction": ("block", "mixed", "bracket"), "two_finger": ("cylinder", "tee", "mixed")}
+"""What each tool is tried on: parts that it is made for, and all together."""
+MIXES = tuple(dict.fromkeys(itertools.chain(*KINDS.values())))
+"""Every bin that is filled; the frames of one serve all tools."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """A published grasp as judged; `off_m` and `penetration_m` are the verdict's `distance_m` and `penetration_m`.
+
+    Of suction, `off_m` is the error along the approach that `sigma_z_m` speaks of; of two fingers, by how much the part is
+    wider than said.
+    """
+
+    ok: bool
+    penetration_m: float
+    off_m: float
+    sigma_z_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Pick:
+    """The first cycle of one tool on one bin."""
+
+    tool: str
+    code: int
+    grips: tuple[Grip, ...]
+    timing_ms: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """One bin: its parts against the segments, which do not depend on the tool, and a cycle of each of its tools."""
+
+    kinds: str
+    seed: int
+    parts: tuple[PartScore, ...]
+    picks: tuple[Pick, ...]
+
+
+def sit(world: str, seeds: Iterable[int], count: int) -> Iterator[Sheet]:
+    """All bins of `count` parts, kind by kind. Raises InputError for an unknown world."""
+    for kinds, seed in itertools.product(MIXES, seeds):
+        yield sheet(exam.paper(world, seed, kinds=kinds, parts=count), kinds)
+
+
+def sheet(paper: Paper, kinds: str) -> Sheet:
+    """A bin of `KINDS`, rendered once, by each of its tools."""
+    tools = [tool for tool, tried_on in KINDS.items() if kinds in tried_on]
+    papers = [exam.for_tool(paper, tool) for tool in tools]
+    outcomes = [pipeline.run(asked.inputs) for asked in papers]
+    picks = (_pick(*each) for each in zip(tools, papers, outcomes, strict=True))
+    return Sheet(kinds, paper.scene.seed, _parts(paper, outcomes[0]), tuple(picks))
+
+
+def _pick(tool: str, paper: Paper, outcome: CycleResult) -> Pick:
+    published = outcome.result.grasps
+    verdicts = grasps.judged(paper, [grasps.taken(grasp) for grasp in published])
+    grips = (Grip(verdict.ok, verdict.penetration_m, verdict.distance_m, grasp.sigma.z_m)
+             for verdict, grasp in zip(verdicts, published, strict=True))
+    return Pick(tool, outcome.result.return_code.value, tuple(grips), outcome.result.timing_ms)
+
+
+def _parts(paper: Paper, outcome: CycleResult) -> tuple[PartScore, ...]:
+    """Without depth there are no segments, and no part is found."""
+    if outcome.rectified is None:
+        raise RuntimeError("a cycle of the exam always has a window")
+    view = outcome.rectified.window
+    nobody = np.zeros((view.height // 2, view.width // 2), dtype=np.int32)
+    labels = outcome.segments.parts if outcome.segments is not None else nobody
+    return tuple(parts.score(paper, paper.truth(view), view, labels))
