@@ -18,6 +18,7 @@ from binpick.sim import score
 STAGES = ("bin", "segment", "grasp", "clearance")
 """What follows depth; their sum is `sum`, the whole computation `cycle`."""
 FIRST = 5
+OFF = "off: how far a cup's TCP is above the true surface; how much wider than close_m what the fingers hold is"
 Figures = dict[str, Any]
 Item = TypeVar("Item")
 
@@ -53,7 +54,7 @@ def row(tool: str, picks: Sequence[Pick]) -> Figures:
         "penetration_max_mm": round(1000 * max(depths, default=0.0), 2),
         "codes": {str(code): times for code, times in sorted(Counter(pick.code for pick in picks).items())},
         "sigma_z": _sigma(picks) if tool == "suction" else None,
-        "wider_mm": _wider(picks) if tool == "two_finger" else None,
+        "off_mm": _off(picks),
         "stages_ms": _stages(picks),
     }
 
@@ -71,12 +72,14 @@ def _share(good: int, of: int) -> Figures:
 
 def _sigma(picks: Sequence[Pick]) -> Figures:
     """How many of the grasps that hold have their TCP within 1 and 2 sigma of the true surface, along the approach."""
-    ratios = np.array([abs(grip.off_m) / grip.sigma_z_m for pick in picks for grip in pick.grips if grip.ok])
-    return {f"within_{limit}": _share(int((ratios <= limit).sum()), ratios.size) for limit in (1, 2)}
+    holding = [grip for pick in picks for grip in pick.grips if grip.ok]
+    ratios = np.array([abs(grip.off_m) / grip.sigma_z_m for grip in holding])
+    within = {f"within_{limit}": _share(int((ratios <= limit).sum()), ratios.size) for limit in (1, 2)}
+    return {"median_mm": round(1000 * float(np.median([grip.sigma_z_m for grip in holding])), 3) if holding else None, **within}
 
 
-def _wider(picks: Sequence[Pick]) -> Figures:
-    """By how much the parts that two fingers hold are wider than `close_m`: the median, and the one furthest off, mm."""
+def _off(picks: Sequence[Pick]) -> Figures:
+    """`off_m` of the grasps that hold: the median, and the one furthest from 0, mm."""
     off = np.array([1000 * grip.off_m for pick in picks for grip in pick.grips if grip.ok])
     if not off.size:
         return {"median": None, "worst": None}
@@ -97,26 +100,31 @@ def tables(run: Figures) -> Group:
     head = (f"Exam world {run['world']}, {run['parts']} parts, seeds {run['seeds'][0]} to {run['seeds'][-1]}, "
             f"tables {run['exam_sha256'][:12]}")
     grips = Table("tool", "parts", "P@1 (95 %)", "P@5 (95 %)", "with a grasp", "collisions (worst)", "z within 1σ, 2σ",
-                  "wider (worst)", "codes", title=head, title_justify="left")
+                  "off (worst)", "codes", title=head, title_justify="left")
     stages = Table("median, ms", "parts", *STAGES, "sum", "cycle")
     for tool, rows in run["tools"].items():
         for mix, each in rows.items():
             grips.add_row(tool, mix, _range(each["p_at_1"]), _range(each["p_at_5"]), _of(each["with_grasp"]),
-                          f"{each['collisions']} ({each['penetration_max_mm']:.1f} mm)", *_errors(each),
+                          f"{each['collisions']} ({each['penetration_max_mm']:.1f} mm)", _within(each), _off_by(each),
                           " ".join(f"{code}: {times}" for code, times in each["codes"].items()), end_section=mix == "all")
             stages.add_row(tool, mix, *("-" if ms is None else f"{ms:.1f}" for ms in each["stages_ms"].values()),
                            end_section=mix == "all")
     whole = Table(f"parts seen {parts.PLAIN_VIEW:.0%} and more", f"one segment (IoU > {parts.HALF:.1f})", "share (95 %)")
     for mix, found in run["segments"].items():
         whole.add_row(mix, _of(found), _percent(found))
-    return Group(grips, whole, stages)
+    return Group(grips, OFF, whole, stages)
 
 
-def _errors(each: Figures) -> tuple[str, str]:
-    sigma, wider = each["sigma_z"], each["wider_mm"]
-    if sigma is not None:
-        return " ".join("-" if sigma[k]["share"] is None else f"{sigma[k]['share']:.0%}" for k in ("within_1", "within_2")), ""
-    return "", "-" if wider["median"] is None else f"{wider['median']:.1f} ({wider['worst']:.1f}) mm"
+def _within(each: Figures) -> str:
+    sigma = each["sigma_z"]
+    if sigma is None or sigma["median_mm"] is None:
+        return "-"
+    return f"{sigma['within_1']['share']:.0%} {sigma['within_2']['share']:.0%} (σ {sigma['median_mm']:.2f} mm)"
+
+
+def _off_by(each: Figures) -> str:
+    off = each["off_mm"]
+    return "-" if off["median"] is None else f"{off['median']:.2f} ({off['worst']:.1f}) mm"
 
 
 def _range(share: Figures) -> str:
