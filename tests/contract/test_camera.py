@@ -2,6 +2,9 @@
 
 import contextlib
 import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +27,13 @@ WIDTH, HEIGHT = 640, 400
 FULL = (1936, 1216)
 LIGHT = Light(exposure_us=3000.0, gain_db=1.5, projector=True)
 NOBODY = "127.0.250.250"
+SENDER = """
+import sys, numpy as np
+from binpick.sim.gige import GigePair
+with GigePair(lambda _index, _light, shot: np.full((1216, 1936), shot, np.uint8), tuple(sys.argv[1:])):
+    print("up", flush=True)
+    sys.stdin.read()
+"""
 
 
 def within(seconds: float) -> int:
@@ -238,9 +248,9 @@ def test_lost_packets_are_sent_again(gige_addresses: tuple[str, str]) -> None:
 
 @contextlib.contextmanager
 def tearing(addresses: tuple[str, str], images: int) -> Iterator[CameraGroup]:
-    """A group whose first images lose half of their packets for good."""
+    """A group whose first images lose some of their packets for good."""
     def image(index: int, _light: Light, shot: int) -> Image:
-        pair.drop_packets(0.5 if shot <= images else 0.0, seed=shot, resends=shot > images)
+        pair.drop_packets(0.05 if shot <= images else 0.0, seed=shot, resends=shot > images)
         return coded(index, shot)
 
     pair = GigePair(image, addresses, (WIDTH, HEIGHT))
@@ -265,6 +275,30 @@ def test_an_image_that_stays_incomplete_is_refused(gige_addresses: tuple[str, st
             group.capture(LIGHT, within(5))
         assert [(status.connected, status.failures) for status in group.statuses()] == [(True, 3), (True, 3)]
         assert group.capture(LIGHT, within(3)).left.frame_id == 4
+
+
+def stall(process: subprocess.Popen[bytes], seconds: float) -> None:
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.gige
+def test_cameras_that_stand_still_for_half_a_second_are_waited_for(gige_addresses: tuple[str, str]) -> None:
+    with (subprocess.Popen([sys.executable, "-c", SENDER, *gige_addresses], stdin=subprocess.PIPE,
+                           stdout=subprocess.PIPE) as sender,
+          contextlib.closing(CameraGroup(aravis(gige_addresses), max_skew_us=1_000_000.0)) as group):
+        assert sender.stdout is not None
+        assert sender.stdout.readline() == b"up\n"
+        group.open(within(5))
+        for shot, delay_s in enumerate((0.0, 0.005, 0.01, 0.015, 0.02, 0.025)):      # an image takes 3 ms and then 13 ms
+            stalling = threading.Timer(delay_s, stall, (sender, 0.5))
+            stalling.start()
+            pair = group.capture(LIGHT, within(5))
+            stalling.join()
+            assert [frame.image.min() for frame in (pair.left, pair.right)] == [pair.left.frame_id, pair.right.frame_id]
+            assert pair.left.frame_id > shot
+        assert [(status.connected, status.error) for status in group.statuses()] == [(True, "")] * 2
 
 
 @pytest.mark.gige

@@ -20,7 +20,7 @@ class Bench:
     def __init__(self) -> None:
         self.registers = Registers("127.0.9.2", 640, 400, "S1")
         self.written: list[str] = []
-        self.resends: list[tuple[int, int, int, int]] = []
+        self.resends: list[tuple[int, int, int]] = []
         self.releases = 0
         self.control = Control(self.registers, lambda name, _at: self.written.append(name),
                                lambda *request: self.resends.append(request), self._released)
@@ -120,7 +120,7 @@ def test_resend_requests_count_for_the_controllers_host_only(bench: Bench) -> No
     bench.write(CCP, 2)
     assert bench.ask(Code.PACKETRESEND, request, (OWNER[0], 6001), flags=0) is None
     assert bench.ask(Code.PACKETRESEND, request, OTHER, flags=0) is None
-    assert bench.resends == [(5, 17, 20, 0)]
+    assert bench.resends == [(5, 17, 20)]
 
 
 def test_an_unknown_command_is_refused_and_noise_is_not_answered(bench: Bench) -> None:

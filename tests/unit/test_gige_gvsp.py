@@ -2,7 +2,6 @@
 
 import socket
 import struct
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -73,20 +72,9 @@ def test_lost_packets_come_when_asked_for(sender: Sender, receiver: socket.socke
     assert 0 < len(packets) < block.count
     sender.drop(0.0, seed=0)
     for index in set(range(block.count)) - set(packets):
-        sender.resend(receiver.getsockname(), 1, index, index, time.time_ns())
+        sender.resend(receiver.getsockname(), 1, index, index)
     packets |= received(receiver)
     assert body(packets, block) == block.rows[:, 8:].tobytes() + b"".join(part[8:] for part in block.tail[:-1])
-
-
-def test_requests_that_piled_up_are_answered_once(sender: Sender, receiver: socket.socket) -> None:
-    block = Block(1, 0, image_of(120, 160), 600)
-    before = time.time_ns()
-    sender.send(block, receiver.getsockname())
-    received(receiver)
-    asked = time.time_ns()
-    for asked_ns in (before, asked, asked, asked):
-        sender.resend(receiver.getsockname(), 1, 0, 99, asked_ns)
-    assert len(received(receiver)) == sender.resent == block.count
 
 
 def test_no_resend_of_what_was_never_sent_or_is_forgotten(sender: Sender, receiver: socket.socket) -> None:
@@ -94,11 +82,11 @@ def test_no_resend_of_what_was_never_sent_or_is_forgotten(sender: Sender, receiv
     for number in range(1, KEPT_BLOCKS + 2):
         sender.send(Block(number, 0, image_of(4, 4), 600), target)
     received(receiver)
-    sender.resend(target, 1, 0, 9, time.time_ns())           # pushed out by newer ones
-    sender.resend(target, 99, 0, 9, time.time_ns())          # never was
-    sender.resend(target, KEPT_BLOCKS, 0, 0xFFFFFF, time.time_ns())
+    sender.resend(target, 1, 0, 9)                  # pushed out by newer ones
+    sender.resend(target, 99, 0, 9)                 # never was
+    sender.resend(target, KEPT_BLOCKS, 0, 0xFFFFFF)
     assert len(received(receiver)) == 3
     assert sender.resent == 3
     sender.forget()
-    sender.resend(target, KEPT_BLOCKS, 0, 9, time.time_ns())
+    sender.resend(target, KEPT_BLOCKS, 0, 9)
     assert not received(receiver)

@@ -13,12 +13,12 @@ class Control:
     """Answers datagrams; reading is free, writing is for the one peer that took control and keeps talking.
 
     A datagram that comes twice, since its sender missed the acknowledge, is acknowledged again and not carried out again.
-    `written(feature, arrived_ns)` is called after every successful write, `resend(block, first, last, arrived_ns)` when
-    the controller's host asks for packets again, `released()` when control ends.
+    `written(feature, arrived_ns)` is called after every successful write, `resend(block, first, last)` when the controller's
+    host asks for packets again, `released()` when control ends.
     """
 
     def __init__(self, registers: Registers, written: Callable[[str, int], None],
-                 resend: Callable[[int, int, int, int], None], released: Callable[[], None]) -> None:
+                 resend: Callable[[int, int, int], None], released: Callable[[], None]) -> None:
         self._registers = registers
         self._written = written
         self._resend = resend
@@ -81,7 +81,7 @@ class Control:
             case Code.PACKETRESEND:
                 if self._controller and self._controller[0] == peer[0]:
                     _channel, block, first, last = _exactly(">HHII", command.payload)
-                    self._resend(block, first & 0xFFFFFF, last & 0xFFFFFF, arrived_ns)
+                    self._resend(block, first & 0xFFFFFF, last & 0xFFFFFF)
                 return None
         raise Fault(Status.NOT_IMPLEMENTED)
 

@@ -4,7 +4,6 @@ import socket
 import struct
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,8 +22,6 @@ LINK_BITS_PER_S = 2e9
 SO_TIMESTAMPNS = 35
 """The socket option of asm-generic/socket.h, which Python does not name: when did the datagram arrive?"""
 POLL_S = 0.1
-REQUESTS = 4096
-"""For packets to be sent again: on a bad link they come in floods, and commands go before them."""
 CONTROL_BYTES = 4 << 20
 """What may wait at the control socket; the kernel clips it to net.core.rmem_max."""
 
@@ -115,13 +112,15 @@ class Device:
                 self._socket.sendto(reply, peer)
 
     def _serve(self) -> None:
-        requests: deque[tuple[bytes, Peer, int]] = deque(maxlen=REQUESTS)
+        requests: dict[tuple[Peer, bytes], tuple[bytes, int]] = {}       # by what they ask for: repeated, one counts once
         while not self._off.is_set():
             try:
                 self._socket.settimeout(0 if requests else POLL_S)
                 datagram, ancillary, _flags, peer = self._socket.recvmsg(2048, 64)
             except BlockingIOError:
-                self.receive(*requests.popleft())
+                peer, _ = oldest = next(iter(requests))
+                datagram, arrived_ns = requests.pop(oldest)
+                self.receive(datagram, peer, arrived_ns)
                 continue
             except TimeoutError:
                 self._control.expire(device_clock_ns())
@@ -132,7 +131,7 @@ class Device:
                 raise
             self._control.expire(device_clock_ns())
             if gvcp.is_resend(datagram):
-                requests.append((datagram, peer, _arrival_ns(ancillary)))
+                requests[peer, datagram[gvcp.HEADER.size:]] = datagram, _arrival_ns(ancillary)
             elif datagram:
                 self.receive(datagram, peer, _arrival_ns(ancillary))
 
@@ -159,9 +158,9 @@ class Device:
         return (socket.inet_ntoa(self.registers.integer("GevSCDA").to_bytes(4, "big")),
                 self.registers.integer("GevSCPHostPort"))
 
-    def _resend(self, block: int, first: int, last: int, arrived_ns: int) -> None:
+    def _resend(self, block: int, first: int, last: int) -> None:
         with suppress(OSError):
-            self.sender.resend(self._target(), block, first, last, arrived_ns)
+            self.sender.resend(self._target(), block, first, last)
 
     def _start_acquisition(self) -> None:
         with self._state:

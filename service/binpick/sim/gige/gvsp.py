@@ -11,7 +11,7 @@ import time
 from collections import OrderedDict
 
 import numpy as np
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, UInt8
 
 from binpick.data import Image
 from binpick.sim.gige.features import GVSP_OVERHEAD, MONO8
@@ -30,7 +30,7 @@ MAX_SEGMENTS = 60
 
 
 class Block:
-    """One image in packets: 0 is the leader, then the payload, last the trailer. `left_ns`: when each left last, or 0."""
+    """One image in packets: 0 is the leader, then the payload, last the trailer. `sent` of them have left already."""
 
     def __init__(self, number: int, timestamp_ns: int, image: Image, packet_size: int) -> None:
         height, width = image.shape
@@ -38,6 +38,7 @@ class Block:
         data = np.ascontiguousarray(image).reshape(-1)
         whole = data.size // payload
         self.number = number
+        self.sent = 0
         self.rows: UInt8[np.ndarray, "packets bytes"] = np.empty((whole, HEADER + payload), np.uint8)
         self.rows[:, :5] = np.frombuffer(_header(number, PAYLOAD, 0)[:5], np.uint8)
         self.rows[:, 5:HEADER] = np.arange(1, whole + 1, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]
@@ -47,7 +48,6 @@ class Block:
         rest = data[whole * payload:].tobytes()
         tail = [_header(number, PAYLOAD, whole + 1) + rest] if rest else []
         self.tail = [*tail, _header(number, TRAILER, whole + len(tail) + 1) + struct.pack(">HHI", 0, IMAGE, height)]
-        self.left_ns: Int64[np.ndarray, "packets"] = np.zeros(self.count, np.int64)
 
     @property
     def count(self) -> int:
@@ -107,14 +107,13 @@ class Sender:
             while len(self._kept) > KEPT_BLOCKS:
                 self._kept.popitem(last=False)
             lost = self._random.random(block.count) < self._loss
-        block.left_ns[0] = time.time_ns()
         if not lost[0]:
             self._socket.sendto(block.leader, target)
         self._send_rows(block, ~lost[1:1 + len(block.rows)], target)
-        block.left_ns[1 + len(block.rows):] = time.time_ns()
         for packet, gone in zip(block.tail, lost[1 + len(block.rows):], strict=True):
             if not gone:
                 self._socket.sendto(packet, target)
+        block.sent = block.count
 
     def _send_rows(self, block: Block, kept: Bool[np.ndarray, "packets"], target: tuple[str, int]) -> None:
         size = block.rows.shape[1]
@@ -122,9 +121,9 @@ class Sender:
         start = time.monotonic()
         for first in range(0, len(kept), segments):
             burst = block.rows[first:first + segments][kept[first:first + segments]]
-            block.left_ns[1 + first:1 + min(first + segments, len(kept))] = time.time_ns()
             if len(burst):
                 self._socket.sendto(burst.data, target)
+            block.sent = 1 + min(first + segments, len(kept))
             ahead = start + (first + segments) * size * 8 / self._bits_per_s - time.monotonic()
             if ahead > 0.0002:       # shorter sleeps overshoot
                 time.sleep(ahead)
@@ -137,24 +136,18 @@ class Sender:
             return 1
         return max(1, min(MAX_SEGMENTS, BURST_BYTES // size))
 
-    def resend(self, target: tuple[str, int], number: int, first: int, last: int, asked_ns: int) -> None:
-        """Packets `first` to `last` of a kept block that had left when they were asked for; of other blocks, nothing.
-
-        Those that left later are on their way: answering each request that piled up while this process stalled would take it
-        longer than the stall.
-        """
+    def resend(self, target: tuple[str, int], number: int, first: int, last: int) -> None:
+        """Packets `first` to `last` of a kept block, as far as they have been sent once; of other blocks, nothing."""
         with self._lock:
             block = self._kept.get(number)
             if block is None or not self._resends:
                 return
-            left_ns = block.left_ns[first:last + 1]
-            chosen = first + np.flatnonzero((left_ns > 0) & (left_ns < asked_ns))
-            block.left_ns[chosen] = time.time_ns()
+            chosen = range(first, min(last + 1, block.sent))
             lost = self._random.random(len(chosen)) < self._loss
             self.resent += len(chosen)
         for index, gone in zip(chosen, lost, strict=True):
             if not gone:
-                self._socket.sendto(block.packet(int(index)), target)
+                self._socket.sendto(block.packet(index), target)
 
     def close(self) -> None:
         """Silent from here on."""
