@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from binpick import geometry, pipeline, recording
+from binpick import answer, geometry, pipeline, recording
 from binpick.data import Grasp, Light, StereoPair
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
+from binpick.frames import Frames
 from binpick.lab import exam
 from binpick.result import CycleInput, PoseMessage, Request
 from binpick.settings import SuctionTool, TwoFingerTool
@@ -146,7 +147,7 @@ def test_a_pose_that_is_none_costs_itself_alone(paper):
     sound = Grasp(T_bin_tcp=T_bin_tcp, tool=1, part_id=1, open_m=0.0, close_m=0.0, quality=0.5, seal_m=0.0,
                   room=1.0, sigma_xy_m=1e-4, sigma_z_m=1e-4, sigma_tilt_rad=0.01, clearance_m=0.01)
     lost = replace(sound, T_bin_tcp=np.full((4, 4), np.nan))
-    messages, counts = pipeline._publishable([lost, sound], paper.inputs, pipeline._Frames.of(paper.inputs))
+    messages, counts = answer.publishable([lost, sound], paper.inputs, Frames.of(paper.inputs))
     assert [message.id for message in messages] == ["1-1"]
     assert counts == {"gate_not_finite": 1, "published": 1}
 
