@@ -14,7 +14,7 @@ from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segment
 from binpick.errors import Code
 from binpick.geometry import Transform
 from binpick.message import BinMessage, PoseMessage, Triple, Wire, Xyzw
-from binpick.outcomes import NO_MEMORY, Memory
+from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.rig import Rig
 from binpick.settings import Job
 
@@ -240,6 +240,8 @@ class Published:
     result: Result
     body: bytes
     triggered_ns: int
+    attempts: tuple[Attempt, ...] = ()
+    """Its grasps as they will be remembered when their outcomes are told."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,22 +1,25 @@
 """The memory of outcomes: what failed is not offered again until something changed there."""
 
 import functools
+import importlib
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from binpick import geometry, pipeline
+from binpick import geometry, pipeline, recording, settings
 from binpick.data import Grasp, HeightMap, frozen
 from binpick.errors import Code
 from binpick.grasp import memory as laws
 from binpick.outcomes import COLLISION, DOUBLE, DROPPED, MISSED, OK, SKIPPED, UNREACHABLE, Attempt, Grid, Look, Memory
-from binpick.result import CycleInput, CycleResult
+from binpick.result import CycleInput, CycleResult, Result
 
 LATER = "2026-01-01T00:10:00Z"
 SEED = 3
@@ -291,3 +294,22 @@ def test_skipped_grasps_change_nothing_and_the_answer_is_the_same_byte_for_byte(
     one, other = (pipeline.run(replace(inputs, cycle_id=2, memory=m)) for m in (told, read_back))
     assert one.result.timeless_bytes() == other.result.timeless_bytes()
     assert one.memory == other.memory
+
+
+def test_pick_starts_from_what_a_recording_remembers_unless_told_to_start_fresh(
+        inputs: CycleInput, first: CycleResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missed = replace(inputs, cycle_id=2, memory=laws.after(Memory(), first, {1: MISSED}))
+    recording.save(tmp_path / "two", missed, pipeline.run(missed).result)
+    # pick asks a cell file for the job
+    cell = settings.Cell(bins=(inputs.job.bin,), tools=inputs.job.tools, recipes=(inputs.job.recipe,))
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(cell.model_dump(mode="json", exclude_unset=True)), encoding="utf-8")
+    pick = importlib.import_module("binpick.cli.pick")
+    found = {}
+    for fresh in (False, True):
+        pick.pick(left=tmp_path / "two/left.png", right=tmp_path / "two/right.png", rig=tmp_path / "two/rig.json",
+                  cell=tmp_path / "cell.yaml", out=tmp_path / "out", fresh=fresh)
+        found[fresh] = Result.model_validate_json((tmp_path / "out/result.json").read_bytes())
+    assert "nothing is remembered" in capsys.readouterr().err
+    stored = recording.load(tmp_path / "two")[1]
+    assert found[False].grasps == stored.grasps
+    assert [g.position_m for g in found[True].grasps] == [g.position_m for g in first.result.grasps]
