@@ -105,6 +105,8 @@ class Memory(Wire):
 
     attempts: tuple[Attempt, ...] = ()
     look: Look | None = None
+    silent: bool = False
+    """Whether a robot picks here and does not tell: published parts were seen to go, and nobody spoke of it since."""
 
 
 NO_MEMORY = Memory()

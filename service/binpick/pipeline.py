@@ -13,7 +13,7 @@ from binpick.answer import answer, code_of, publishable
 from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
-from binpick.grasp import clearance, fingers, memory, rank, suction
+from binpick.grasp import clearance, fingers, memory, rank, suction, verification
 from binpick.result import (
     CycleInput,
     CycleResult,
@@ -86,7 +86,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     if measured < LEAST_MEASURED:
         return seen
     with clock.stage("memory"):
-        inputs = replace(inputs, memory=memory.standing(inputs.memory, heights, inputs.pair.captured_at))
+        verdicts = verification.verified(inputs.memory, heights)
+        inputs = replace(inputs, memory=memory.standing(inputs.memory, heights, inputs.pair.captured_at, verdicts))
     with clock.stage("segment"):
         segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
     with clock.stage("grasp"):
@@ -100,7 +101,7 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
     T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
-    return replace(seen, result=result, segments=segments,
+    return replace(seen, result=result, segments=segments, verified=verdicts,
                    memory=memory.looked(inputs, result.grasps, T_bin_frame, heights, segments))
 
 

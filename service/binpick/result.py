@@ -229,8 +229,15 @@ class CycleResult:
     depth: Depth | None = None
     cloud: OrganisedCloud | None = None
     segments: Segments | None = None
+    verified: tuple[Attempt, ...] = ()
+    """What became of grasps of the last cycle that nobody spoke of, as far as heights tell."""
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
+
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """The published grasps, as they are remembered once their outcomes are told."""
+        return self.memory.look.attempts if self.memory is not None and self.memory.look is not None else ()
 
 
 @dataclass(frozen=True, slots=True)

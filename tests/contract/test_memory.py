@@ -111,11 +111,11 @@ def configured(port: int, folder: Path | None, **changes: object) -> settings.Ce
 
 
 @asynccontextmanager
-async def controlled(port: int, images: tuple[Image, Image], folder: Path | None = None,
+async def controlled(port: int, cameras: Showing, folder: Path | None = None,
                      **changes: object) -> AsyncIterator[tuple[Cell, Plc]]:
     cell_settings = configured(port, folder, **changes)
     modbus = ModbusSettings(host="127.0.0.1", port=port)
-    async with Cell(cell_settings, RIG, showing(images), boot_id=77) as cell:
+    async with Cell(cell_settings, RIG, cameras, boot_id=77) as cell:
         server = ModbusServer(cell, cell, modbus, cell_settings)
         await server.start()
         try:
@@ -140,7 +140,7 @@ async def look(plc: Plc) -> PlcResult:
 def test_a_miss_told_over_modbus_is_not_offered_again_until_the_bin_is_exchanged(
         free_port: int, two_blocks: tuple[Image, Image], tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with controlled(free_port, two_blocks, tmp_path / "state") as (cell, plc):
+        async with controlled(free_port, showing(two_blocks), tmp_path / "state") as (cell, plc):
             first = await look(plc)
             missed = spots(first)[0]
             for _ in range(2):                                       # a report that is repeated counts once
@@ -152,20 +152,55 @@ def test_a_miss_told_over_modbus_is_not_offered_again_until_the_bin_is_exchanged
             await plc.report(first.seq, first.records[0].grasp_id, OK)
             assert offers(await look(plc), missed)                   # the later word counts
             await plc.report(first.seq, first.records[0].grasp_id, MISSED)
-        async with controlled(free_port, two_blocks, tmp_path / "state") as (cell, plc):
+        async with controlled(free_port, showing(two_blocks), tmp_path / "state") as (cell, plc):
             assert not offers(await look(plc), missed)               # remembered by the next daemon
             assert await plc.exchanged() == 0
             assert not cell.snapshot().valid
             assert offers(await look(plc), missed)
-        async with controlled(free_port, two_blocks, tmp_path / "state") as (_, plc):
+        async with controlled(free_port, showing(two_blocks), tmp_path / "state") as (_, plc):
             assert offers(await look(plc), missed)                   # forgotten on disk too
 
     asyncio.run(scenario())
 
 
+def test_a_pick_nobody_speaks_of_is_verified_by_the_next_look(
+        free_port: int, two_blocks: tuple[Image, Image], pictures: Callable[..., tuple[Image, Image]],
+        caplog: pytest.LogCaptureFixture) -> None:
+    def verdicts() -> list[str]:
+        said = [record.getMessage() for record in caplog.records if "by the cameras" in record.getMessage()]
+        caplog.clear()
+        return said
+
+    async def scenario() -> None:
+        cameras = showing(two_blocks)
+        async with controlled(free_port, cameras) as (_, plc):
+            first = await look(plc)
+            await look(plc)
+            assert verdicts() == []                                  # nobody is known to pick here
+            picked = int(np.linalg.norm(spots(first)[0][:2] - BLOCKS[0][:2, 3]) > 0.03)
+            cameras.images = pictures(BLOCKS[1 - picked])
+            third = await look(plc)
+            assert verdicts() == ["cycle 2 grasp 1: outcome 1 by the cameras"]
+            fourth = await look(plc)
+            assert verdicts() == ["cycle 3 grasp 1: outcome 2 by the cameras"]
+            assert fourth.return_code == 0
+            assert fourth.records[0].quality < 0.3 < third.records[0].quality
+            assert (await look(plc)).return_code == Code.ALL_BLOCKED_BY_HISTORY
+            assert await plc.exchanged() == 0
+            fresh = await look(plc)
+            assert fresh.records[0].quality == third.records[0].quality
+            await plc.report(fresh.seq, fresh.records[0].grasp_id, SKIPPED)
+            verdicts()
+            assert spots(await look(plc)).shape == spots(fresh).shape
+            assert verdicts() == []                                  # a controller that speaks is believed
+
+    with caplog.at_level("INFO", "binpick.cell.worker"):
+        asyncio.run(scenario())
+
+
 def test_when_everything_has_failed_the_code_is_104(free_port: int, two_blocks: tuple[Image, Image]) -> None:
     async def scenario() -> None:
-        async with controlled(free_port, two_blocks) as (cell, plc):
+        async with controlled(free_port, showing(two_blocks)) as (cell, plc):
             for _ in range(10):
                 result = await look(plc)
                 if not result.records:
@@ -182,7 +217,7 @@ def test_when_everything_has_failed_the_code_is_104(free_port: int, two_blocks: 
 
 def test_the_exchange_of_an_unknown_bin_is_refused(free_port: int, two_blocks: tuple[Image, Image]) -> None:
     async def scenario() -> None:
-        async with controlled(free_port, two_blocks) as (cell, plc):
+        async with controlled(free_port, showing(two_blocks)) as (cell, plc):
             assert await plc.exchanged(bin_number=9) == Code.UNKNOWN_ITEM
             with pytest.raises(NotInControl):
                 cell.forget(1, "rest")
@@ -262,7 +297,7 @@ def test_outcomes_told_over_rest_are_remembered_and_recorded(
     assert [attempt.outcome for attempt in inputs.memory.attempts] == [MISSED]
     assert pipeline.run(inputs).result.timeless_bytes() == stored.timeless_bytes()
     document = json.loads((tmp_path / "state" / NAME).read_text())
-    assert [attempt["outcome"] for attempt in document["bins"]["1"]] == [MISSED]
+    assert [attempt["outcome"] for attempt in document["bins"]["1"]["attempts"]] == [MISSED]
 
 
 def test_a_damaged_file_is_set_aside_and_an_alarm(free_port: int, two_blocks: tuple[Image, Image], tmp_path: Path) -> None:

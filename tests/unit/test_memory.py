@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from hypothesis import given
+from hypothesis import settings as examples
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -124,6 +125,7 @@ def test_a_failure_stands_while_nothing_changes_there() -> None:
     assert laws.standing(remembered, bin_map(lambda grid: np.copyto(grid, 0.1)), LATER).attempts == ()
 
 
+@examples(max_examples=50, deadline=None, derandomize=True)
 @given(depth_mm=st.floats(-60, 60).filter(lambda d: abs(d) > 4), at=st.tuples(st.integers(30, 50), st.integers(40, 60)))
 def test_any_change_of_a_third_of_the_patch_forgets(depth_mm: float, at: tuple[int, int]) -> None:
     def change(grid: np.ndarray) -> None:
@@ -164,6 +166,7 @@ def spoken(reports: list[tuple[int, int, int]], start: Memory = Memory()) -> Mem
     return start
 
 
+@examples(max_examples=50, deadline=None, derandomize=True)
 @given(reports=REPORTS, seed=st.integers(0, 1000))
 def test_the_order_of_reports_does_not_matter_and_saying_it_twice_changes_nothing(
         reports: list[tuple[int, int, int]], seed: int) -> None:
@@ -173,6 +176,7 @@ def test_the_order_of_reports_does_not_matter_and_saying_it_twice_changes_nothin
     assert {a.name[1:]: a.outcome for a in spoken(reports).attempts} == {(c, g): outcome for c, g, outcome in reports}
 
 
+@examples(max_examples=50, deadline=None, derandomize=True)
 @given(reports=REPORTS, later=st.integers(1, 7))
 def test_a_later_word_replaces_the_earlier_one(reports: list[tuple[int, int, int]], later: int) -> None:
     for cycle_id, number, _ in reports:
@@ -180,6 +184,7 @@ def test_a_later_word_replaces_the_earlier_one(reports: list[tuple[int, int, int
         assert spoken([(cycle_id, number, later)], spoken(reports)) == spoken(corrected)
 
 
+@examples(max_examples=50, deadline=None, derandomize=True)
 @given(early=REPORTS, meanwhile=REPORTS)
 def test_what_is_told_while_a_cycle_runs_is_not_lost(early: list[tuple[int, int, int]],
                                                      meanwhile: list[tuple[int, int, int]]) -> None:

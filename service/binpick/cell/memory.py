@@ -38,7 +38,7 @@ def recall(state: State, bin_number: int) -> Memory:
     acted = last is not None and not state.valid and state.withdrawn in READ
     if acted and last is not None and last.result.cycle_id == memory.look.attempts[0].cycle_id:
         return memory
-    return Memory(attempts=memory.attempts)
+    return memory.model_copy(update={"look": None})
 
 
 def remember(state: State, cycle_id: int, bin_number: int, before: Memory, after: Memory) -> State:

@@ -14,7 +14,7 @@ from binpick.cell.board import Board
 from binpick.cell.machine import State
 from binpick.errors import InputError
 from binpick.message import Wire
-from binpick.outcomes import Attempt, Memory
+from binpick.outcomes import NO_MEMORY, Memory
 
 NAME = "memory.json"
 DAMAGED = "memory.damaged.json"
@@ -24,11 +24,11 @@ log = logging.getLogger(__name__)
 
 
 class MemoryFile(Wire):
-    """memory.json: what is remembered of each bin, by its number. What a cycle saw is not kept: a restart breaks the chain."""
+    """memory.json: what is remembered of each bin, by its number; but for what was seen last: a restart breaks that chain."""
 
     format: Literal["binpick-memory"] = "binpick-memory"
     version: Literal[1] = 1
-    bins: dict[int, tuple[Attempt, ...]]
+    bins: dict[int, Memory]
 
 
 class Store:
@@ -59,11 +59,11 @@ class Store:
                         "failures are forgotten")
         except OSError as error:
             raise InputError(f"memory.directory: {path} cannot be read: {error.strerror}") from error
-        return {number: Memory(attempts=attempts) for number, attempts in file.bins.items()}, ""
+        return file.bins, ""
 
     def save(self, memories: Mapping[int, Memory]) -> None:
         """Replaces the file; whenever process or machine die, the old or the new one is there whole. Raises OSError."""
-        file = MemoryFile(bins={number: memory.attempts for number, memory in sorted(memories.items()) if memory.attempts})
+        file = MemoryFile(bins=lasting(memories))
         partial = self._directory / f".{NAME}"
         with partial.open("wb") as opened:
             opened.write(file.model_dump_json(indent=1).encode())
@@ -75,6 +75,12 @@ class Store:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def lasting(memories: Mapping[int, Memory]) -> dict[int, Memory]:
+    """What of the memories is kept."""
+    kept = {number: memory.model_copy(update={"look": None}) for number, memory in sorted(memories.items())}
+    return {number: memory for number, memory in kept.items() if memory != NO_MEMORY}
 
 
 def thread(store: Store, board: Board) -> threading.Thread:
@@ -93,14 +99,10 @@ def _keep(store: Store, board: Board) -> None:
         memories = board.wait(news, threading.TIMEOUT_MAX).memories
         if memories is kept:
             return
-        if _lasting(memories) != _lasting(kept):
+        if lasting(memories) != lasting(kept):
             try:
                 store.save(memories)
             except OSError as error:
                 log.error("the memory of outcomes is not on disk: %s", error)
                 board.step(machine.alarm, f"memory: it cannot be written and will not survive a restart: {error.strerror}")
         kept = memories
-
-
-def _lasting(memories: Mapping[int, Memory]) -> dict[int, tuple[Attempt, ...]]:
-    return {number: memory.attempts for number, memory in memories.items() if memory.attempts}

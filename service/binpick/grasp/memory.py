@@ -16,7 +16,7 @@ from binpick import geometry
 from binpick.data import Grasp, HeightMap, Segments
 from binpick.geometry import Transform
 from binpick.message import Triple
-from binpick.outcomes import COLLISION, DOUBLE, DROPPED, MISSED, UNREACHABLE, Attempt, Grid, Look, Memory
+from binpick.outcomes import COLLISION, DOUBLE, DROPPED, MISSED, OK, UNREACHABLE, Attempt, Grid, Look, Memory
 from binpick.result import CycleInput, CycleResult, GraspMessage
 
 FAILURES = (MISSED, DROPPED, COLLISION, DOUBLE)
@@ -50,13 +50,15 @@ def tenths(heights: HeightMap) -> Tenths:
     return np.where(seen, whole, UNSEEN).astype(np.int16)
 
 
-def standing(memory: Memory, heights: HeightMap, captured_at: str) -> Memory:
-    """Without the attempts around which something changed, or which are too old."""
+def standing(memory: Memory, heights: HeightMap, captured_at: str, verdicts: Sequence[Attempt] = ()) -> Memory:
+    """With what was seen, and without the attempts around which something changed, or which are too old."""
     now = tenths(heights)
-    kept = [attempt for attempt in memory.attempts
+    attempts = sorted((*memory.attempts, *verdicts), key=lambda attempt: attempt.name)[-KEPT:]
+    kept = [attempt for attempt in attempts
             if _age(attempt.captured_at, captured_at) < FORGET_AFTER
             and unchanged(attempt.patch.cells, _patch(now, heights, attempt.position_m))]
-    return memory.model_copy(update={"attempts": tuple(kept)})
+    silent = memory.silent or any(verdict.outcome in (OK, DOUBLE) for verdict in verdicts)
+    return memory.model_copy(update={"attempts": tuple(kept), "silent": silent})
 
 
 def unchanged(before: Tenths, after: Tenths) -> bool:
@@ -94,7 +96,7 @@ def looked(inputs: CycleInput, published: Sequence[GraspMessage], T_bin_frame: T
     `T_bin_frame` maps the grasps' frame to the bin's.
     """
     if not published:
-        return Memory(attempts=inputs.memory.attempts)
+        return inputs.memory.model_copy(update={"look": None})
     now = tenths(heights)
     parts = np.zeros(now.shape, dtype=np.int16)
     attempts: list[Attempt] = []
@@ -109,8 +111,8 @@ def looked(inputs: CycleInput, published: Sequence[GraspMessage], T_bin_frame: T
             captured_at=inputs.pair.captured_at, cycle_id=inputs.cycle_id, grasp=grasp.number, tool=grasp.tool.number,
             position_m=(x, y, z), approach=(ax, ay, az), reach_m=max(SAME_SPOT_M, half_m),
             patch=Grid.of(_patch(now, heights, (x, y, z)))))
-    return Memory(attempts=inputs.memory.attempts,
-                  look=Look(heights=Grid.of(now), parts=Grid.of(parts), attempts=tuple(attempts)))
+    look = Look(heights=Grid.of(now), parts=Grid.of(parts), attempts=tuple(attempts))
+    return inputs.memory.model_copy(update={"look": look})
 
 
 def told(memory: Memory, attempt: Attempt, outcome: int) -> Memory:
@@ -132,7 +134,7 @@ def after(memory: Memory, cycle: CycleResult, outcomes: Mapping[int, int]) -> Me
     Cycles of one bin need different ids or instants, for these name the attempts. Raises KeyError for a grasp it has not.
     """
     memory = cycle.memory or memory
-    published = {attempt.grasp: attempt for attempt in memory.look.attempts} if memory.look is not None else {}
+    published = {attempt.grasp: attempt for attempt in cycle.attempts}
     for number, outcome in sorted(outcomes.items()):
         memory = told(memory, published[number], outcome)
     return memory
