@@ -5,6 +5,7 @@ Positions and heights are in the frame `bin`, metres. `binpick.grasp.memory` hol
 
 import base64
 import binascii
+import functools
 import zlib
 from datetime import datetime
 from typing import Annotated, Literal
@@ -19,7 +20,14 @@ OK, MISSED, DROPPED, COLLISION, SKIPPED, DOUBLE, UNREACHABLE = OUTCOMES = tuple(
 """As the wire has them."""
 PACKING = 1
 """Of zlib's 9: a whole bin takes 3 ms, a patch none."""
+UNPACKED = 512
+"""Grids held unpacked: what is remembered is looked at in every cycle."""
 Side = Annotated[int, Field(ge=0, le=4096)]
+
+
+@functools.lru_cache(UNPACKED)
+def _unpacked(packed: str) -> bytes:
+    return zlib.decompress(base64.b64decode(packed, validate=True))
 
 
 class Grid(Wire):
@@ -38,15 +46,12 @@ class Grid(Wire):
     @property
     def cells(self) -> Int16[np.ndarray, "rows cols"]:
         """Unpacked."""
-        return np.frombuffer(self._raw(), dtype="<i2").astype(np.int16).reshape(self.rows, self.cols)
-
-    def _raw(self) -> bytes:
-        return zlib.decompress(base64.b64decode(self.packed, validate=True))
+        return np.frombuffer(_unpacked(self.packed), dtype="<i2").astype(np.int16).reshape(self.rows, self.cols)
 
     @model_validator(mode="after")
     def _whole(self) -> "Grid":
         try:
-            size = len(self._raw())
+            size = len(_unpacked(self.packed))
         except (binascii.Error, zlib.error) as error:
             raise ValueError(f"packed: {error}") from error
         if size != 2 * self.rows * self.cols:

@@ -49,17 +49,16 @@ class Store:
         """
         path = self._directory / NAME
         try:
-            file = MemoryFile.model_validate_json(path.read_bytes())
-        except FileNotFoundError:
-            return {}, ""
-        except ValidationError as error:
-            aside = self._directory / DAMAGED
-            path.replace(aside)
-            return {}, (f"memory: {path} is damaged ({error.errors()[0]['msg']}) and was set aside as {aside.name}: earlier "
-                        "failures are forgotten")
+            if not path.exists():
+                return {}, ""
+            try:
+                return MemoryFile.model_validate_json(path.read_bytes()).bins, ""
+            except ValidationError as error:
+                path.replace(self._directory / DAMAGED)
+                return {}, (f"memory: {path} is damaged ({error.errors()[0]['msg']}) and was set aside as {DAMAGED}: earlier "
+                            "failures are forgotten")
         except OSError as error:
             raise InputError(f"memory.directory: {path} cannot be read: {error.strerror}") from error
-        return file.bins, ""
 
     def save(self, memories: Mapping[int, Memory]) -> None:
         """Replaces the file; whenever process or machine die, the old or the new one is there whole. Raises OSError."""

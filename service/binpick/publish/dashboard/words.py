@@ -12,7 +12,7 @@ OWNERS = {"modbus": "Modbus/TCP", "rest": "REST", "none": "nobody"}
 SURVIVORS = {"parts": "parts seen", "faces": "faces on them", "spots": "spots tried", "sealed": "the cup seals",
              "clear": "the tool is clear", "published": "published"}
 LOSSES = {"rim_not_on_one_part": "lip off the part", "no_seal": "too uneven to seal", "tilt": "tilted too far",
-          "collide": "tool would collide", "gate_not_finite": "last gate: not a number",
+          "collide": "tool would collide", "history": "failed here before", "gate_not_finite": "last gate: not a number",
           "gate_quaternion": "last gate: no unit quaternion", "gate_pregrasp": "last gate: pre-grasp is elsewhere",
           "gate_outside_bin": "last gate: outside the bin", "gate_out_of_reach": "last gate: out of reach",
           "gate_tilt": "last gate: tilted too far", "gate_older_than_trigger": "last gate: older than its trigger"}
