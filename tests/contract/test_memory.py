@@ -311,6 +311,21 @@ def test_a_damaged_file_is_set_aside_and_an_alarm(free_port: int, two_blocks: tu
             assert not (tmp_path / NAME).exists()
 
 
+def test_a_disk_that_refuses_is_an_alarm_and_the_cell_goes_on(
+        free_port: int, two_blocks: tuple[Image, Image], tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    with serving(free_port, two_blocks, folder) as (client, cell):
+        grasps = client.post("/v1/cycles?wait=true", json={"frame": "bin"}).json()["grasps"]
+        folder.rmdir()
+        folder.write_text("in the way")
+        assert client.post(f"/v1/cycles/1/grasps/{grasps[0]['id']}/outcome", json={"code": MISSED}).status_code == 204
+        deadline = time.monotonic() + 5
+        while not cell.snapshot().faults and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert "will not survive a restart" in cell.snapshot().faults[0]
+        assert client.post("/v1/cycles?wait=true", json={"frame": "bin"}).json()["return_code"]["value"] == 0
+
+
 def test_a_folder_that_cannot_be_made_stops_the_start(free_port: int, two_blocks: tuple[Image, Image], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"memory\.directory"):

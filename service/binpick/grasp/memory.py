@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int16
+from jaxtyping import Bool, Float32, Int, Int16
 
 from binpick import geometry
 from binpick.data import Grasp, HeightMap, Segments
@@ -77,16 +77,27 @@ def weighed(grasps: Sequence[Grasp], memory: Memory) -> tuple[list[Grasp], int]:
     Blocked is the very pose that was told to have failed or to be unreachable, and, from two failures of a tool on a part on,
     every pose of that tool that comes the same way.
     """
-    if not memory.attempts:
+    speaking = [attempt for attempt in memory.attempts if attempt.outcome in (*FAILURES, UNREACHABLE)]
+    if not grasps or not speaking:
         return list(grasps), 0
-    kept: list[Grasp] = []
-    for grasp in grasps:
-        near = [attempt for attempt in memory.attempts if _near(grasp, attempt)]
-        failures = [attempt for attempt in near if attempt.outcome in FAILURES]
-        if not (any(_repeats(grasp, attempt) for attempt in near)
-                or sum(_angle(grasp, attempt) < SAME_WAY_RAD for attempt in failures) >= BLOCKING):
-            kept.append(replace(grasp, quality=round(grasp.quality * PENALTY ** len(failures), 3)) if failures else grasp)
+    failures, blocked = _history(grasps, speaking)
+    kept = [replace(grasp, quality=round(grasp.quality * PENALTY ** count, 3)) if count else grasp
+            for grasp, count, out in zip(grasps, failures.tolist(), blocked.tolist(), strict=True) if not out]
     return sorted(kept, key=lambda grasp: -grasp.quality), len(grasps) - len(kept)
+
+
+def _history(grasps: Sequence[Grasp], attempts: Sequence[Attempt]) -> tuple[Int[np.ndarray, "g"], Bool[np.ndarray, "g"]]:
+    """Of each grasp how many failures there were on its part, and whether it is blocked."""
+    T_bin_tcp = np.stack([grasp.T_bin_tcp for grasp in grasps])
+    distances_m = np.linalg.norm(T_bin_tcp[:, None, :3, 3] - np.array([attempt.position_m for attempt in attempts]), axis=2)
+    cosines = T_bin_tcp[:, :3, 2] @ np.array([attempt.approach for attempt in attempts]).T
+    same_tool = np.equal.outer([grasp.tool for grasp in grasps], [attempt.tool for attempt in attempts])
+    failed = np.array([attempt.outcome in FAILURES for attempt in attempts])
+    told = np.array([attempt.source == "told" for attempt in attempts])
+    near = same_tool & failed & (distances_m <= np.array([attempt.reach_m for attempt in attempts]))
+    again = same_tool & told & (distances_m <= SAME_SPOT_M) & (cosines > math.cos(SAME_POSE_RAD))
+    ways = (near & (cosines > math.cos(SAME_WAY_RAD))).sum(axis=1)
+    return near.sum(axis=1), again.any(axis=1) | (ways >= BLOCKING)
 
 
 def looked(inputs: CycleInput, published: Sequence[GraspMessage], T_bin_frame: Transform, heights: HeightMap,
@@ -147,25 +158,6 @@ def merged(before: Memory, after: Memory, now: Memory) -> Memory:
         if old.get(attempt.name) != attempt:
             after = told(after, attempt, attempt.outcome)
     return after
-
-
-def _near(grasp: Grasp, attempt: Attempt) -> bool:
-    """The same tool at the same part."""
-    return grasp.tool == attempt.tool and _distance_m(grasp, attempt) <= attempt.reach_m
-
-
-def _repeats(grasp: Grasp, attempt: Attempt) -> bool:
-    """The very pose of which the controller said that it failed, or could not be reached."""
-    return (attempt.source == "told" and attempt.outcome in (*FAILURES, UNREACHABLE)
-            and _distance_m(grasp, attempt) <= SAME_SPOT_M and _angle(grasp, attempt) < SAME_POSE_RAD)
-
-
-def _distance_m(grasp: Grasp, attempt: Attempt) -> float:
-    return float(np.linalg.norm(grasp.T_bin_tcp[:3, 3] - attempt.position_m))
-
-
-def _angle(grasp: Grasp, attempt: Attempt) -> float:
-    return float(np.arccos(np.clip(grasp.T_bin_tcp[:3, 2] @ np.array(attempt.approach), -1, 1)))
 
 
 def _patch(now: Tenths, heights: HeightMap, position_m: Triple) -> Int16[np.ndarray, "side side"]:
