@@ -63,6 +63,7 @@ def test_two_fingers_lift_a_cylinder(cylinders):
 
 def test_fingers_above_a_part_come_up_empty(cylinders):
     part = cylinders.parts[0]
-    up = lift(cylinders, across(part) @ translation(0.0, 0.0, -0.03), TwoFingerTool(kind="two_finger"), part.part_id, open_m=0.05)
+    above = across(part) @ translation(0.0, 0.0, -0.03)
+    up = lift(cylinders, above, TwoFingerTool(kind="two_finger"), part.part_id, open_m=0.05)
     assert not up.held
     assert up.raised_m < 0.005
