@@ -26,7 +26,7 @@ from binpick.scene.location import Location
 from binpick.settings import Job
 
 REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
-           "collide")
+           "collide", "history")
 """Counts of tries that fell out; the largest dominates the funnel."""
 
 
@@ -78,6 +78,8 @@ def code_of(filled: load_carrier.Filling, counts: dict[str, int], messages: tupl
         return Code.OVERFILLED if filled.overfilled else Code.OK
     if counts["clear"]:
         return Code.ALL_OUT_OF_REACH
+    if counts.get("history"):
+        return Code.ALL_BLOCKED_BY_HISTORY
     if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
     if filled.proved_empty:

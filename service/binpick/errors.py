@@ -79,7 +79,8 @@ MESSAGES: dict[Code, str] = {
     Code.NOTHING_GRASPABLE: "Parts are there, but no surface fits the tool.",
     Code.BIN_EMPTY: "The bin is empty: its floor was seen and nothing lies on it.",
     Code.ALL_COLLIDE: "Every grasp would hit the bin, a part, or something not seen.",
-    Code.ALL_BLOCKED_BY_HISTORY: "Every grasp left has failed here before: stir the bin or exchange it.",
+    Code.ALL_BLOCKED_BY_HISTORY: "Every grasp left has failed here before: stir the bin, try another tool, or "
+                                 "exchange the bin and say so (command 8).",
     Code.NO_DEPTH: "Too few pixels could be measured: check light, projector and lens.",
     Code.BIN_MISMATCH: "What stands there does not match the bin's model.",
     Code.BIN_UNKNOWN: "Nothing was found, but too little of the floor was seen to call the bin empty.",

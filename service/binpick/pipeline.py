@@ -13,7 +13,7 @@ from binpick.answer import answer, code_of, publishable
 from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
-from binpick.grasp import clearance, fingers, rank, suction
+from binpick.grasp import clearance, fingers, memory, rank, suction
 from binpick.result import (
     CycleInput,
     CycleResult,
@@ -85,6 +85,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points)
     if measured < LEAST_MEASURED:
         return seen
+    with clock.stage("memory"):
+        inputs = replace(inputs, memory=memory.standing(inputs.memory, heights, inputs.pair.captured_at))
     with clock.stage("segment"):
         segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
     with clock.stage("grasp"):
@@ -97,7 +99,9 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     counts |= gate_counts
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
-    return replace(seen, result=result, segments=segments)
+    T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
+    return replace(seen, result=result, segments=segments,
+                   memory=memory.looked(inputs, result.grasps, T_bin_frame, heights, segments))
 
 
 def _candidates(segments: Segments, sigma_z_m: Float32[np.ndarray, "h w"], scene: clearance.Obstacles, job: Job,
@@ -125,7 +129,8 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
         free += [grasp for grasp, hit in zip(mine, clearance.blocked(mine, tool, heights), strict=True) if not hit]
     collide, looked = len(found) - len(free), 0
     kept: list[Grasp] = []
-    for grasp in rank.ordered(free, segments, *job.tools):
+    ordered, blocked = memory.weighed(rank.ordered(free, segments, *job.tools), inputs.memory)
+    for grasp in ordered:
         if len(kept) == wanted or looked == MOST_LOOKED_AT:
             break
         if rank.adds(grasp, kept):
@@ -135,7 +140,7 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
                 collide += 1
             else:
                 kept.append(replace(grasp, clearance_m=distance_m))
-    return kept, {"collide": collide, "clear": len(kept)}
+    return kept, {"collide": collide, "history": blocked, "clear": len(kept)}
 
 
 @dataclass(slots=True)

@@ -2,7 +2,7 @@
 
     left.png right.png         the raw images, lossless          rig.json   the rig as applied
     left-02.png right-02.png   of the second shot, and so on     job.json   recipe, bin and tool as applied
-    input.json                 cycle, request, facts per frame
+    input.json                 cycle, request, memory of outcomes before the cycle, facts per frame
     result.json                the answer as it was published
 """
 
@@ -26,6 +26,7 @@ from binpick import __version__, rig
 from binpick.data import Frame, Image, StereoPair, frozen
 from binpick.errors import ImageError, InputError
 from binpick.message import Wire
+from binpick.outcomes import NO_MEMORY, Memory
 from binpick.result import CycleInput, Request, Result
 from binpick.settings import Job
 
@@ -75,6 +76,8 @@ class InputFile(PairFacts):
     simulated: bool
     more: tuple[PairFacts, ...] = ()
     """The shots after the first, in order."""
+    memory: Memory = NO_MEMORY
+    """What was remembered of the bin before the cycle."""
 
 
 def folder_name(inputs: CycleInput) -> str:
@@ -112,7 +115,8 @@ def load(folder: Path) -> tuple[CycleInput, Result]:
         raise InputError(f"{folder / 'input.json'}: not a whole recording: {1 + len(facts.more)} shots, but the recipe in "
                          f"job.json has {len(job.recipe.shots)}")
     pair, *more = (_pair(folder, number, shot) for number, shot in enumerate((facts, *facts.more), start=1))
-    inputs = CycleInput(facts.cycle_id, pair, used_rig, job, facts.request, facts.simulated, tuple(more))
+    inputs = CycleInput(facts.cycle_id, pair, used_rig, job, facts.request, facts.simulated, tuple(more),
+                        facts.memory)
     return inputs, _parse(folder / "result.json", Result)
 
 
@@ -120,11 +124,12 @@ def _files(inputs: CycleInput, result: Result) -> dict[str, bytes]:
     facts = InputFile(
         made_with={"binpick": __version__, "opencv": cv2.__version__, "numpy": np.__version__, "machine": platform.machine()},
         cycle_id=inputs.cycle_id, request=inputs.request, simulated=inputs.simulated, **dict(_pair_facts(inputs.pair)),
-        more=tuple(map(_pair_facts, inputs.more)))
+        more=tuple(map(_pair_facts, inputs.more)), memory=inputs.memory)
+    absent = {name for name, value in (("more", inputs.more), ("memory", inputs.memory)) if value in ((), NO_MEMORY)}
     images = {_name(side, number): _png(frame.image) for number, pair in enumerate(inputs.pairs, start=1)
               for side, frame in (("left", pair.left), ("right", pair.right))}
     return images | {
-        "input.json": facts.model_dump_json(indent=1, exclude=None if inputs.more else {"more"}).encode(),
+        "input.json": facts.model_dump_json(indent=1, exclude=absent).encode(),
         "rig.json": rig.dump(inputs.rig), "job.json": inputs.job.model_dump_json(indent=1).encode(),
         "result.json": result.json_bytes(),
     }

@@ -14,6 +14,7 @@ from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segment
 from binpick.errors import Code
 from binpick.geometry import Transform
 from binpick.message import BinMessage, PoseMessage, Triple, Wire, Xyzw
+from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.rig import Rig
 from binpick.settings import Job
 
@@ -199,6 +200,8 @@ class CycleInput:
     request: Request
     simulated: bool = False
     more: tuple[StereoPair, ...] = ()
+    memory: Memory = NO_MEMORY
+    """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
 
     @property
     def pairs(self) -> tuple[StereoPair, ...]:
@@ -226,6 +229,8 @@ class CycleResult:
     depth: Depth | None = None
     cloud: OrganisedCloud | None = None
     segments: Segments | None = None
+    memory: Memory | None = None
+    """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +240,8 @@ class Published:
     result: Result
     body: bytes
     triggered_ns: int
+    attempts: tuple[Attempt, ...] = ()
+    """Its grasps as they will be remembered when their outcomes are told."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from binpick.data import CameraStatus
 from binpick.errors import Code
 from binpick.publish import handshake
-from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Inputs, Report, Start, Withdraw
+from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Forget, Inputs, Report, Start, Withdraw
 from binpick.publish.handshake import Phase, State
 from binpick.publish.image import Echo
 from binpick.publish.registers import Ctrl, Detail, Status
@@ -60,6 +60,11 @@ class Bench:
                 facts = replace(facts, current=self.cycle_id, acquired=False, valid=False)
                 self.state = handshake.started(self.state, self.inputs, self.cycle_id, ECHO,
                                                self.inputs.now_ns + self.timeout_ms * MS)
+            case Forget() if self.refuse_with:
+                self.state = handshake.refused(self.state, self.inputs, self.refuse_with)
+            case Forget():
+                facts = replace(facts, valid=False)
+                self.state = handshake.done(self.state, self.inputs, ECHO)
             case Abort(cycle_id):
                 facts = replace(facts, current=0, finished=cycle_id, code=-26, valid=True, grasps=0)
             case Acknowledge():
@@ -168,8 +173,32 @@ def test_a_trigger_while_busy_is_refused_and_the_cycle_goes_on(busy: Bench) -> N
     assert busy.taken() == []
 
 
+def test_an_exchanged_bin_is_a_command_without_a_cycle(ready: Bench) -> None:
+    assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=8) == Status.ACK | Status.VALID | Status.LAST_PAGE
+    assert ready.taken() == [Forget()]
+    assert (ready.shown.command, ready.shown.cmd_seq, ready.shown.cycle_id, ready.shown.code) == (8, 10, 0, Code.OK)
+    assert ready.shown.echo == ECHO
+    assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=8) & Status.VALID        # written again by a cyclic writer
+    assert ready.taken() == []
+    ready.plc(ENABLE | TRIG | RES_ACK, command=8)
+    assert ready.plc(ENABLE, command=8) == Status.READY
+
+
+def test_an_unknown_bin_is_not_exchanged_and_a_busy_cell_exchanges_none(ready: Bench) -> None:
+    ready.refuse_with = Code.UNKNOWN_ITEM
+    assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=8) == Status.NACK
+    assert ready.shown.latched == Code.UNKNOWN_ITEM
+    assert ready.plc(ENABLE) == Status.READY
+    ready.refuse_with = None
+    ready.plc(ENABLE | TRIG, cmd_seq=11)
+    ready.taken()
+    assert ready.plc(ENABLE | TRIG, cmd_seq=12, command=8) & Status.NACK
+    assert ready.taken() == []
+    assert ready.shown.latched == Code.BUSY
+
+
 @pytest.mark.parametrize(("command", "code"), [
-    (0, Code.BAD_ARGUMENT), (10, Code.BAD_ARGUMENT), *((c, Code.NOT_APPLICABLE) for c in range(2, 9))])
+    (0, Code.BAD_ARGUMENT), (10, Code.BAD_ARGUMENT), *((c, Code.NOT_APPLICABLE) for c in range(2, 8))])
 def test_commands_that_do_not_exist(ready: Bench, command: int, code: Code) -> None:
     assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=command) == Status.NACK
     assert (ready.shown.code, ready.shown.latched, ready.shown.cmd_seq) == (code, code, 10)

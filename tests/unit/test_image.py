@@ -80,7 +80,7 @@ UNITS = ((100, 119), (120, 145), (146, 171), (172, 197), (198, 223), (100, 224),
 def test_identity_is_made_of_literal_words() -> None:
     words = image.encode(snapshot(), signals())
     assert len(words) == 360
-    assert words[:8] == (0xB1D0, 1, 0x0102, 0x0304, 0x47F1, 0x2000, 1 << 1 | 1 << 9, 4)
+    assert words[:8] == (0xB1D0, 1, 0x0102, 0x0304, 0x47F1, 0x2000, 1 << 1 | 1 << 8 | 1 << 9, 4)
     assert words[10] == VALID == 0b110010
     assert words[12:16] == (2, 1, 0b1001, 0)
 

@@ -12,6 +12,7 @@ import pytest
 from binpick import pipeline, recording, settings
 from binpick.data import Frame, StereoPair, frozen
 from binpick.errors import Code, ImageError, InputError, RigError
+from binpick.outcomes import Attempt, Grid, Look, Memory
 from binpick.recording import Recorder
 from binpick.result import CycleInput, Request, failure
 from binpick.rig import Rig
@@ -62,7 +63,7 @@ def test_what_comes_back_is_what_went_in(tmp_path: Path) -> None:
         "input.json", "job.json", "left.png", "result.json", "rig.json", "right.png"]
     facts = json.loads((tmp_path / "one" / "input.json").read_text())
     assert set(facts["made_with"]) == {"binpick", "opencv", "numpy", "machine"}
-    assert "more" not in facts            # as before there were shots
+    assert not {"more", "memory"} & set(facts)            # as before there were shots and outcomes
 
 
 def test_a_recording_computes_to_the_same_bytes(tmp_path: Path) -> None:
@@ -70,6 +71,15 @@ def test_a_recording_computes_to_the_same_bytes(tmp_path: Path) -> None:
     recording.save(tmp_path / "one", inputs(), live)
     got, stored = recording.load(tmp_path / "one")
     assert pipeline.run(got).result.timeless_bytes() == live.timeless_bytes() == stored.timeless_bytes()
+
+
+def test_what_was_remembered_before_the_cycle_is_in_it(tmp_path: Path) -> None:
+    patch = Grid.of(np.arange(400, dtype=np.int16).reshape(20, 20))
+    attempt = Attempt(captured_at="2026-01-02T03:04:05.678Z", cycle_id=11, grasp=1, tool=1, position_m=(0.1, 1 / 3, 0.02),
+                      approach=(0.0, 0.0, -1.0), reach_m=0.02, patch=patch, outcome=2)
+    given = replace(inputs(), memory=Memory(attempts=(attempt,), look=Look(heights=patch, parts=patch, attempts=(attempt,))))
+    recording.save(tmp_path / "one", given, failure(12, Request(), Code.NO_DEPTH))
+    assert recording.load(tmp_path / "one")[0].memory == given.memory
 
 
 def three_shots() -> CycleInput:

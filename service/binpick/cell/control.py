@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import logging
+import threading
 import time
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 from binpick import pipeline, settings
 from binpick.camera.base import Clock
-from binpick.cell import machine, worker
+from binpick.cell import machine, memory, store, worker
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
 from binpick.cell.worker import Cameras, Run, Worker
@@ -24,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class Cell:
-    """Implements publish.ports.View and Control. Nothing here blocks but `artefact`.
+    """Implements publish.ports.View and Control. Nothing here blocks but `artefact`, and the start, which reads the memory.
 
     Live inside `async with cell:`, or from `launch` to `close`: a worker thread computes, and a task of the running loop
     enforces deadlines, so that a worker stuck in a driver delays no answer.
@@ -33,9 +34,16 @@ class Cell:
     def __init__(self, cell: settings.Cell, rig: Rig, cameras: Cameras, run: Run = pipeline.run, *, boot_id: int,
                  recorder: Recorder | None = None, clock: Clock = time.monotonic_ns) -> None:
         self._settings, self._rig, self._clock = cell, rig, clock
-        self._board = Board(machine.State(max_age_ns=cell.result_max_age_ms * 1_000_000), boot_id, cell.control)
+        kept = store.Store(cell.memory.directory) if cell.memory.directory is not None else None
+        memories, trouble = kept.load() if kept is not None else ({}, "")
+        if trouble:
+            log.error(trouble)
+        self._board = Board(machine.State(
+            max_age_ns=cell.result_max_age_ms * 1_000_000, memories=MappingProxyType(memories),
+            faults=(trouble,) if trouble else ()), boot_id, cell.control)
         self._gallery = Gallery()
         self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, recorder, clock))
+        self._keeper = store.thread(kept, self._board) if kept is not None else None
         self._supervisor: asyncio.Task[None] | None = None
 
     def snapshot(self) -> Snapshot:
@@ -91,13 +99,22 @@ class Cell:
     def report(self, cycle_id: int, grasp: int, outcome: int, source: Source) -> None:
         """What became of a grasp."""
         self._admit(source)
-        self._board.step(machine.report, cycle_id, grasp, outcome)
+        self._board.step(memory.report, cycle_id, grasp, outcome)
         log.info("cycle %d grasp %d: outcome %d by %s", cycle_id, grasp, outcome, source)
+
+    def forget(self, bin_number: int, source: Source) -> None:
+        """The bin was exchanged: its memory of outcomes is dropped. Raises NotInControl, UnknownItem, Busy."""
+        self._admit(source)
+        number = settings.resolve(self._settings, bin_number=bin_number).bin.number
+        self._board.step(memory.forget, number)
+        log.info("bin %d was exchanged, says %s: its memory is empty", number, source)
 
     def launch(self) -> asyncio.Task[None]:
         """Starts the worker thread, and the supervisor on the running loop, which ends only by `close` or by a defect."""
         self._supervisor = asyncio.get_running_loop().create_task(self._supervise(), name="the cell's supervisor")
         self._thread.start()
+        if self._keeper is not None:
+            self._keeper.start()
         return self._supervisor
 
     @property
@@ -114,7 +131,7 @@ class Cell:
         self.stop()
         loop = asyncio.get_running_loop()
         deadline = loop.time() + limit_s
-        while self._thread.is_alive() and loop.time() < deadline:
+        while any(thread.is_alive() for thread in self._threads) and loop.time() < deadline:
             await asyncio.sleep(0.005)
         if self._supervisor is not None:
             self._supervisor.cancel()
@@ -132,6 +149,10 @@ class Cell:
     async def __aexit__(self, kind: type[BaseException] | None, error: BaseException | None,
                         traceback: TracebackType | None) -> None:
         await self.close()
+
+    @property
+    def _threads(self) -> tuple[threading.Thread, ...]:
+        return (self._thread,) if self._keeper is None else (self._thread, self._keeper)
 
     def _admit(self, source: Source) -> None:
         owner = self._settings.control

@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from binpick.data import CameraStatus
 from binpick.errors import Busy, Code, InputError, NotApplicable, NotReady
+from binpick.outcomes import Memory
 from binpick.result import Owner, Phase, Published, Request, Snapshot, failure
 from binpick.settings import Job
 
@@ -18,6 +19,8 @@ KEPT = 16
 """Finished results in memory, and the ones whose outcomes may be reported."""
 OUTCOMES = range(1, 8)
 """1 ok, 2 missed, 3 dropped, 4 collision, 5 skipped, 6 double, 7 unreachable."""
+TRIGGERED_AGAIN, ACKNOWLEDGED = "triggered again", "acknowledged"
+"""Ends of a result that its controller brought about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,10 @@ class Ticket:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """All that the cell knows; times are the host's monotonic clock."""
+    """All that the cell knows; times are the host's monotonic clock.
+
+    `memories` are by bin; `exchanged` is the last cycle that saw a bin's predecessor.
+    """
 
     max_age_ns: int
     cameras: tuple[CameraStatus, ...] = ()
@@ -47,6 +53,8 @@ class State:
     withdrawn: str = ""
     finished: tuple[Published, ...] = ()
     outcomes: Mapping[tuple[int, int], int] = field(default_factory=lambda: MappingProxyType({}))
+    memories: Mapping[int, Memory] = field(default_factory=lambda: MappingProxyType({}))
+    exchanged: Mapping[int, int] = field(default_factory=lambda: MappingProxyType({}))
     faults: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -89,10 +97,15 @@ def start(state: State, request: Request, job: Job, now_ns: int, timeout_ns: int
                    "is ready")
     if not state.cameras_up:
         raise NotReady("the cell is not ready: " + (_cameras_down(state) or "the cameras are being opened"))
-    state = _invalidate(state, "triggered again")
+    state = invalidate(state, TRIGGERED_AGAIN)
     cycle_id = state.last_id + 1
     ticket = Ticket(cycle_id, request, job, started_ns=now_ns, deadline_ns=now_ns + timeout_ns)
     return _count(replace(state, last_id=cycle_id, ticket=ticket), "started")
+
+
+def invalidate(state: State, why: str) -> State:
+    """The published result holds no longer."""
+    return replace(state, valid=False, withdrawn=why) if state.valid else state
 
 
 def refused(state: State) -> State:
@@ -143,15 +156,15 @@ def acknowledge(state: State, cycle_id: int) -> State:
     """The controller has read the result. Raises NotApplicable unless exactly that one is published and valid."""
     if not state.valid or state.published is None or state.published.result.cycle_id != cycle_id:
         raise NotApplicable(f"the result of cycle {cycle_id} is not waiting to be acknowledged")
-    return _count(_invalidate(state, "acknowledged"), "acknowledged")
+    return _count(invalidate(state, ACKNOWLEDGED), "acknowledged")
 
 
 def withdraw(state: State, reason: str, now_ns: int) -> State:
     """Takes back what runs and what is published; nothing happens when there is neither."""
     if state.running is not None:
         state = _count(_retire(state, Code.ABORTED, now_ns, f"The cycle was withdrawn: {reason}."), "aborted")
-        return _invalidate(state, reason)
-    return _count(_invalidate(state, reason), "withdrawn") if state.valid else state
+        return invalidate(state, reason)
+    return _count(invalidate(state, reason), "withdrawn") if state.valid else state
 
 
 def report(state: State, cycle_id: int, grasp: int, outcome: int) -> State:
@@ -175,7 +188,7 @@ def tick(state: State, now_ns: int) -> State:
     if state.running is not None and now_ns >= state.running.deadline_ns:
         state = _count(_retire(state, Code.TIMEOUT, now_ns), "timeouts")
     if state.valid and state.published is not None and now_ns >= state.published.triggered_ns + state.max_age_ns:
-        state = _count(_invalidate(state, f"older than {state.max_age_ns // 1_000_000} ms"), "expired")
+        state = _count(invalidate(state, f"older than {state.max_age_ns // 1_000_000} ms"), "expired")
     return state
 
 
@@ -197,6 +210,11 @@ def observe(state: State, cameras: tuple[CameraStatus, ...]) -> State:
 def stumble(state: State, fault: str) -> State:
     """Something of ours failed outside a cycle; stays latched until a cycle ends well."""
     return _count(replace(state, faults=(fault,)), "internal_errors")
+
+
+def alarm(state: State, fault: str) -> State:
+    """Something wants attention though cycles run; stays latched until one ends well."""
+    return replace(state, faults=(fault,))
 
 
 def stop(state: State, now_ns: int) -> State:
@@ -235,10 +253,6 @@ def _publish(state: State, published: Published) -> State:
     outcomes = MappingProxyType({key: value for key, value in state.outcomes.items() if key[0] >= oldest})
     state = replace(state, published=published, valid=True, withdrawn="", finished=finished, outcomes=outcomes)
     return _count(state, "finished")
-
-
-def _invalidate(state: State, why: str) -> State:
-    return replace(state, valid=False, withdrawn=why) if state.valid else state
 
 
 def _count(state: State, name: str, by: int = 1) -> State:

@@ -9,11 +9,13 @@ from typing import Protocol, runtime_checkable
 
 from binpick.camera.base import Clock, MonotonicNs
 from binpick.cell import machine
+from binpick.cell import memory as memories
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
 from binpick.cell.machine import State, Ticket
 from binpick.data import CameraStatus, Light, StereoPair
 from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout, PairRefused
+from binpick.outcomes import Memory
 from binpick.recording import Recorder
 from binpick.result import CycleInput, CycleResult, Published, Result, failure
 from binpick.rig import Rig
@@ -99,10 +101,10 @@ class Worker:
         return 0 if self.board.state.cameras_up else attempts
 
     def _cycle(self, ticket: Ticket) -> None:
-        fault, inputs = "", None
+        fault, inputs, memory = "", None, None
         try:
             inputs = self._acquire(ticket)
-            result = self._compute(ticket, inputs)
+            result, memory = self._compute(ticket, inputs)
         except CycleAborted:
             self.board.step(machine.finish, ticket.cycle_id, None)
             return
@@ -115,13 +117,16 @@ class Worker:
             result = self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR)
         finished_ns = self.clock()
         triggered_ns = _triggered_ns(inputs.pair) if inputs else finished_ns
-        published = Published(result, result.json_bytes(), triggered_ns)
+        attempts = memory.look.attempts if memory is not None and memory.look is not None else ()
+        published = Published(result, result.json_bytes(), triggered_ns, attempts)
         # cameras first: who sees the result and triggers again must not be told READY by cameras that just died
         self.board.step(machine.observe, self.cameras.statuses())
         state = self.board.step(machine.finish, ticket.cycle_id, published, fault)
         if machine.find(state, ticket.cycle_id) is not published:
             log.warning("cycle %d: its late result was dropped", ticket.cycle_id)
             return
+        if inputs is not None and memory is not None:
+            self.board.step(memories.remember, ticket.cycle_id, ticket.job.bin.number, inputs.memory, memory)
         log.info("cycle %d: %d %s, %d grasps, %.0f ms", ticket.cycle_id, result.return_code.value, result.return_code.name,
                  len(result.grasps), (finished_ns - ticket.started_ns) / 1e6)
         if result.stopped:
@@ -139,10 +144,11 @@ class Worker:
                 raise PairRefused("the cameras gave a pair that is older than the trigger")
         simulated = any(status.simulated for status in self.cameras.statuses())
         self.board.step(machine.acquired, ticket.cycle_id)
-        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]))
+        memory = memories.recall(self.board.state, ticket.job.bin.number)
+        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]), memory)
 
-    def _compute(self, ticket: Ticket, inputs: CycleInput) -> Result:
-        """The pipeline's result with the cell's own times; its arrays go to the gallery while the id still counts."""
+    def _compute(self, ticket: Ticket, inputs: CycleInput) -> tuple[Result, Memory | None]:
+        """The pipeline's result with the cell's own times, and the memory; its arrays go to the gallery while the id counts."""
         acquired_ns = self.clock()
         cycle = CycleResult(self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR))
         try:
@@ -153,7 +159,8 @@ class Worker:
                 self.gallery.keep(inputs, cycle)
         times = {"acquire": (acquired_ns - ticket.started_ns) / 1e6, **cycle.result.timing_ms,
                  "total": (self.clock() - ticket.started_ns) / 1e6}
-        return cycle.result.model_copy(update={"timing_ms": {name: round(ms, 3) for name, ms in times.items()}})
+        timed = cycle.result.model_copy(update={"timing_ms": {name: round(ms, 3) for name, ms in times.items()}})
+        return timed, cycle.memory
 
     def _proceed(self, ticket: Ticket) -> None:
         """Called between stages: a retired cycle ends at the next step, one out of time says so."""

@@ -24,6 +24,7 @@ def pick(
     recipe: Annotated[int, typer.Option(help="Recipe number; 0: the first.", min=0, max=65535)] = 0,
     flange_pose: Annotated[str, typer.Option(metavar="'X Y Z QX QY QZ QW'", help="Flange in base, metres and quaternion, for a "
                                              "rig that rides on it.")] = "",
+    fresh: Annotated[bool, typer.Option("--fresh", help="Leave out what a recording remembers of its bin.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result instead of a summary.")] = False,
 ) -> None:
     """Find grasps in one stereo pair.
@@ -33,12 +34,16 @@ def pick(
     """
     from binpick import artefacts, pipeline, settings
     from binpick import rig as rig_file
+    from binpick.outcomes import NO_MEMORY
     from binpick.result import Request
 
     loaded_rig, warnings = rig_file.load(rig)
     for warning in warnings:
         typer.echo(warning, err=True)
     inputs = _inputs(left, right, loaded_rig, settings.load(cell), Request(recipe=recipe, T_base_flange=_flange(flange_pose)))
+    if fresh:
+        inputs = replace(inputs, memory=NO_MEMORY)
+        typer.echo("fresh: nothing is remembered of the bin", err=True)
     outcome = pipeline.run(inputs)
     write(out, {"result.json": outcome.result.json_bytes(),
                  **{name: artefacts.render(inputs, outcome, name)[1] for name in PICTURES}})

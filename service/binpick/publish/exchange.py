@@ -102,6 +102,11 @@ class Withdraw:
 
 
 @dataclass(frozen=True, slots=True)
+class Forget:
+    """The bin was exchanged; answer with `done` or `refused` before the next step."""
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """What became of a grasp."""
 
@@ -110,4 +115,4 @@ class Report:
     outcome: int
 
 
-Action: TypeAlias = Start | Abort | Acknowledge | Withdraw | Report
+Action: TypeAlias = Start | Abort | Acknowledge | Withdraw | Forget | Report

@@ -13,13 +13,13 @@ from enum import Enum
 from typing import TypeAlias
 
 from binpick.errors import Code
-from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Inputs, Report, Start, Withdraw
+from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Forget, Inputs, Report, Start, Withdraw
 from binpick.publish.image import NO_ECHO, NO_STATUS, Echo, Signals
 from binpick.publish.registers import PAGE_SIZE, Ctrl, Detail, Status
 
 HEARTBEAT_NS = 2_000_000_000
 COMMANDS = range(1, 10)
-PICK, CLEAR = 1, 9
+PICK, EXCHANGED, CLEAR = 1, 8, 9
 REASONS = {
     Detail.TRIG_FELL: "TRIG fell", Detail.CONNECTION_LOST: "the controller's connection was lost",
     Detail.HEARTBEAT_STOPPED: "the controller's heartbeat stopped", Detail.CLEARED: "the controller cleared errors",
@@ -90,6 +90,11 @@ def started(state: State, inputs: Inputs, cycle_id: int, echo: Echo, deadline_ns
     return replace(state, phase=Phase.BUSY, cmd_seq=inputs.cmd_seq, command=inputs.command, accepted=inputs.cmd_seq,
                    cycle_id=cycle_id, echo=echo, code=Code.BUSY.value, detail=Detail.NONE, acquired=False, grasps=0, page=0,
                    nack=False, error=False, latched=0, deadline_ns=deadline_ns, acknowledgeable=False, turned_away=0)
+
+
+def done(state: State, inputs: Inputs, echo: Echo = NO_ECHO) -> State:
+    """A command without a cycle was carried out."""
+    return replace(started(state, inputs, 0, echo, 0), phase=Phase.DONE, code=Code.OK.value)
 
 
 def refused(state: State, inputs: Inputs, code: Code) -> State:
@@ -251,11 +256,10 @@ def _trigger(state: State, inputs: Inputs) -> Step:
         return state, ()
     if code := _refusal(state, inputs):
         return refused(state, inputs, code), ()
-    if inputs.command == PICK:
-        return state, (Start(),)
+    if inputs.command in (PICK, EXCHANGED):
+        return state, (Start() if inputs.command == PICK else Forget(),)
     held = state.phase is Phase.DONE and inputs.facts.valid
-    cleared = replace(started(state, inputs, 0, NO_ECHO, 0), phase=Phase.DONE, code=Code.OK.value)
-    return cleared, (Withdraw(REASONS[Detail.CLEARED]),) if held else ()
+    return done(state, inputs), (Withdraw(REASONS[Detail.CLEARED]),) if held else ()
 
 
 def _refusal(state: State, inputs: Inputs) -> Code:
@@ -264,7 +268,7 @@ def _refusal(state: State, inputs: Inputs) -> Code:
         return Code.BUSY if state.phase is Phase.BUSY else Code.NOT_READY
     if inputs.command not in COMMANDS:
         return Code.BAD_ARGUMENT
-    if inputs.command not in (PICK, CLEAR):
+    if inputs.command not in (PICK, EXCHANGED, CLEAR):
         return Code.NOT_APPLICABLE
     return Code(_fault(state, inputs))
 

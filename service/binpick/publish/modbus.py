@@ -32,7 +32,7 @@ from binpick import settings
 from binpick.errors import BinpickError, Code, CycleRefused, InputError, NotApplicable, PortInUse
 from binpick.publish import handshake, image
 from binpick.publish.connection import Connection
-from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Inputs, Report, Start, Withdraw
+from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Forget, Inputs, Report, Start, Withdraw
 from binpick.publish.handshake import State
 from binpick.publish.image import Signals
 from binpick.publish.ports import Control, View
@@ -209,6 +209,8 @@ class ModbusServer:
             match action:
                 case Start():
                     return self._start(inputs)
+                case Forget():
+                    return self._forget(inputs)
                 case Report():
                     return self._report(action)
                 case Abort(cycle_id):
@@ -232,6 +234,15 @@ class ModbusServer:
             return handshake.refused(self._state, inputs, error.code)
         deadline_ns = inputs.now_ns + (request.timeout_ms or self._cell.timeout_ms) * 1_000_000
         return handshake.started(self._state, inputs, cycle_id, image.Echo.of(request, job), deadline_ns)
+
+    def _forget(self, inputs: Inputs) -> State:
+        try:
+            job = settings.resolve(self._cell, *(self._holding[AT[name]] for name in ("recipe", "bin")))
+            self._control.forget(job.bin.number, "modbus")
+        except BinpickError as error:
+            log.warning("Modbus: command %d refused: %s", inputs.cmd_seq, error)
+            return handshake.refused(self._state, inputs, error.code)
+        return handshake.done(self._state, inputs, image.Echo(recipe=job.recipe.number, bin=job.bin.number))
 
     def _report(self, outcome: Report) -> State:
         latest = self._view.snapshot().latest

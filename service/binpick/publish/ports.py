@@ -59,3 +59,7 @@ class Control(Protocol):
     def report(self, cycle_id: int, grasp: int, outcome: int, source: Source) -> None:
         """What became of a grasp (numbers as in wire.Outcome); idempotent; raises NotApplicable for unknown ones."""
         ...
+
+    def forget(self, bin_number: int, source: Source) -> None:
+        """The bin was exchanged: drops its memory and withdraws its poses; raises UnknownItem, Busy."""
+        ...

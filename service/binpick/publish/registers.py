@@ -25,8 +25,8 @@ PAGE_SIZE = 4
 HOLDING_WORDS = 35
 INPUT_WORDS = 360
 MIRROR = 1000
-CAPABILITIES = 1 << 1 | 1 << 9
-"""Bit n: command n; 1 pick and 9 clear."""
+CAPABILITIES = 1 << 1 | 1 << 8 | 1 << 9
+"""Bit n: command n; 1 pick, 8 bin exchanged, 9 clear."""
 FRAMES: tuple[FrameName, ...] = ("camera", "bin", "base")
 OWNERS = ("none", "modbus", "rest")
 
@@ -112,7 +112,7 @@ HOLDING = _table(
     0,
     ("ctrl", "u16", 1, "bits", "; ".join(f"b{i} {bit.name}" for i, bit in enumerate(Ctrl))
      + ". A trigger needs ENABLE = 1 and RES_ACK = 0. ROBOT_CLEAR is not evaluated in this version"),
-    ("command", "u16", 1, "", "1 pick, 9 clear errors; 2 to 8 answer -8 in this version"),
+    ("command", "u16", 1, "", "1 pick, 8 bin exchanged: forget its memory, 9 clear errors; 2 to 7 answer -8 in this version"),
     ("cmd_seq", "u16", 1, "", "Your number of this command, 1 to 65535, another one each time; write it after the arguments"),
     ("recipe", "u16", 1, "", "Recipe number; 0 the first"),
     ("tool", "u16", 1, "", "Tool number; 0 the recipe's"),

@@ -94,6 +94,13 @@ class Recording(Strict):
     """Every cycle's input and result are stored below this folder; null: none. A relative one starts where the daemon does."""
 
 
+class MemorySettings(Strict):
+    """Remembers across restarts which grasps failed."""
+
+    directory: Path | None = None
+    """Kept as memory.json in this folder; null: lost with the process. A relative one starts where the daemon does."""
+
+
 class Cell(Strict):
     """One robot cell. Only `bins` (or `bin`) is required."""
 
@@ -113,6 +120,8 @@ class Cell(Strict):
     """Servers."""
     recording: Recording = Recording()
     """What is kept."""
+    memory: MemorySettings = MemorySettings()
+    """The memory of outcomes."""
     timeout_ms: Annotated[int, Field(ge=100, le=60000)] = 5000
     """Time limit of a cycle when the request names none, ms."""
     result_max_age_ms: Annotated[int, Field(ge=500, le=3_600_000)] = 60000

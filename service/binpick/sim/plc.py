@@ -111,6 +111,23 @@ class Plc:
             await self._write(0, [ENABLE])
         return result
 
+    async def exchanged(self, *, bin_number: int = 0, timeout_ms: int = 1000) -> int:
+        """Says that the bin was exchanged (command 8); returns the code of the answer. Raises NotReady, CycleTimeout."""
+        limit_s = timeout_ms / 1000 + MARGIN_S
+        await self._ready(limit_s)
+        self._cmd_seq = self._cmd_seq % 65535 + 1
+        await self._write(27, [bin_number])
+        await self._write(1, [8, self._cmd_seq])
+        await self._write(0, [ENABLE | TRIG])
+        try:
+            await self._until(VALID | NACK, limit_s)
+            code = _signed((await self._read(105, 1))[0])
+            await self._write(0, [ENABLE | TRIG | RES_ACK])
+            await self._until(VALID, limit_s, level=False)
+        finally:
+            await self._write(0, [ENABLE])
+        return code
+
     async def report(self, seq: int, grasp_id: int, outcome: int) -> None:
         """Tells what became of a grasp: 1 ok, 2 missed, 3 dropped, 4 collision, 5 skipped, 6 double, 7 unreachable."""
         await self._write(10, [grasp_id, outcome])
