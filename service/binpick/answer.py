@@ -26,7 +26,7 @@ from binpick.scene.location import Location
 from binpick.settings import Job
 
 REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
-           "collide")
+           "uncertain", "aslant", "wrist", "collide")
 """Counts of tries that fell out; the largest dominates the funnel."""
 
 
@@ -77,6 +77,10 @@ def code_of(filled: load_carrier.Filling, counts: dict[str, int], messages: tupl
     if messages:
         return Code.OVERFILLED if filled.overfilled else Code.OK
     if counts["clear"]:
+        return Code.ALL_OUT_OF_REACH
+    if not counts["collide"] and counts["uncertain"]:
+        return Code.ALL_UNCERTAIN
+    if not counts["collide"] and counts["aslant"] + counts["wrist"]:
         return Code.ALL_OUT_OF_REACH
     if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
