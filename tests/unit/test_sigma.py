@@ -9,6 +9,7 @@ from binpick.errors import Code
 from binpick.grasp import sigma
 from binpick.lab import exam, offsets
 from binpick.result import CycleInput, CycleResult, GraspMessage, PoseMessage, Request, Sigma, ToolMessage, failure
+from binpick.settings import Cup
 from binpick.sim import exam as frozen
 from binpick.sim import score
 from binpick.sim.world import ScenePart, WorldScene
@@ -20,8 +21,11 @@ def one(value):
     return np.array([float(value)])
 
 
-def cups(sigma_px_m=0.0002, rms_m=0.0001, support=150, curved=0.0, at_edge=False, radius_m=0.007):
-    off = sigma.of_cups(one(sigma_px_m), one(rms_m), np.array([support], np.int32), one(curved), np.array([at_edge]), radius_m)
+SINGLE = (Cup(),)
+
+
+def cups(sigma_px_m=0.0002, rms_m=0.0001, support=150, curved=0.0, at_edge=False, at=SINGLE):
+    off = sigma.of_cups(one(sigma_px_m), one(rms_m), np.array([support], np.int32), one(curved), np.array([at_edge]), at)
     return np.array([off.xy_m[0], off.z_m[0], off.tilt_rad[0]])
 
 
@@ -32,7 +36,10 @@ def test_a_cup_is_less_certain_on_noise_on_curves_at_edges_and_on_few_pixels():
     assert (cups(support=30) > plain).all()
     assert (cups(curved=1.0)[:2] > plain[:2]).all()
     assert cups(at_edge=True)[0] > plain[0]
-    assert cups(radius_m=0.02)[2] < plain[2], "a wide lip tilts less"
+    assert cups(at=(Cup(radius_m=0.02),))[2] < plain[2], "a wide lip tilts less"
+    row = (Cup(x_m=0.03), Cup(x_m=-0.03))
+    assert cups(at=row)[2] == pytest.approx(plain[2]), "a row tilts about itself"
+    assert cups(at=(*row, Cup(y_m=0.03), Cup(y_m=-0.03)))[2] < plain[2] / 2
 
 
 def test_no_number_of_pixels_makes_a_surface_exact():

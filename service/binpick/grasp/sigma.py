@@ -13,6 +13,7 @@ from binpick import geometry
 from binpick.data import Grasp
 from binpick.geometry import Transform
 from binpick.rig import Rig
+from binpick.settings.tool import Cup
 
 Values = Float64[np.ndarray, "n"]
 
@@ -23,7 +24,7 @@ SHARED = 0.26
 CURVED = 0.85
 """The same on curved surfaces, which come out too far away (glossy ones the most)."""
 TILTED = 2.0
-"""A plane over a disc tilts by twice its noise over the radius (exactly so for independent noise)."""
+"""A plane over a disc tilts by twice its noise over the radius (exactly so for independent noise): over its points' spread."""
 STEADY_RAD = np.radians(0.25)
 """Tilt that stays where nothing else errs: a surface's own unevenness."""
 EDGE_M = 0.0004
@@ -52,11 +53,14 @@ class Sigmas:
 
 
 def of_cups(sigma_px_m: Values, rms_m: Values, support: Int32[np.ndarray, "n"], curved: Values, at_edge: Bool[np.ndarray, "n"],
-            radius_m: float) -> Sigmas:
+            cups: tuple[Cup, ...]) -> Sigmas:
     """From the mean sigma of the pixels under the lips, what the plane leaves of them (rms), and how many there are.
 
-    `curved`: 0 flat to 1 curved; `at_edge`: the part ends beside a lip; `radius_m`: from the TCP to the outermost lip's rim.
+    `curved`: 0 flat to 1 curved; `at_edge`: the part ends beside a lip. A row of cups tilts about itself as a single one does.
     """
+    at = np.array([(cup.x_m, cup.y_m) for cup in cups])
+    discs = np.mean([cup.radius_m**2 / 4 for cup in cups]) * np.eye(2)
+    radius_m = 2 * float(np.sqrt(np.linalg.eigvalsh(at.T @ at / len(at) + discs)[0]))
     noise_m = np.sqrt((sigma_px_m**2 + rms_m**2) * CORRELATED_PX / np.maximum(support, CORRELATED_PX))
     z_m = np.sqrt(noise_m**2 + (SHARED * sigma_px_m) ** 2 + (CURVED * curved * sigma_px_m) ** 2)
     return Sigmas(xy_m=np.hypot(ASLANT * z_m, EDGE_M * np.maximum(at_edge, curved)), z_m=z_m,

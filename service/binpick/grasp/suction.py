@@ -13,6 +13,8 @@ STAND_OUT_M = 0.0015
 """What stands out further than this beside the lip keeps the cup from closing."""
 SEAL_SHARE = 0.95
 """The measured surface may use this share of the compliance."""
+CENTRINGS = 3
+"""Several cups are centred so many times: each time only the cups near an edge say something."""
 FLAT_RAD, CURVED_RAD = 0.08, 0.16
 """Normals under the lips that turn by less are noise, by more a curve (tuning seeds: 97 % of flat faces below 0.09, 95 % of the
 cylinders above): only on a curve does the middle of a lip lie above the plane. In between it counts in part."""
@@ -31,7 +33,9 @@ def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndar
     reasons = {"spots": len(at) + narrow, "rim_not_on_one_part": narrow}
     if not len(at):
         return [], reasons
-    patch, T_bin_spot = centred(patches(segments, at, T_bin_spot, tool.cups, spacing_m), T_bin_spot)
+    patch = patches(segments, at, T_bin_spot, tool.cups, spacing_m)
+    for _ in tool.cups[:CENTRINGS]:
+        patch, T_bin_spot = centred(patch, T_bin_spot)
     held = on_one_part(patch)
     reasons["rim_not_on_one_part"] += int((~held).sum())
     at, T_bin_spot, patch = at[held], T_bin_spot[held], patch.take(held)
@@ -76,8 +80,7 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
     hint = _long_axes(segments, part) if len(tool.cups) == 1 else T[:, :3, 0]
     T_bin_tcp = frames(-upwards, hint, origin)
     sigma_px_m = _mean(sigma_z_m.ravel().take(place).astype(np.float64), under)
-    off = sigma.of_cups(sigma_px_m, fit.rms_m[chosen], fit.support[chosen], curved, fit.room[chosen] < 1,
-                        max(float(np.hypot(cup.x_m, cup.y_m)) + cup.radius_m for cup in tool.cups))
+    off = sigma.of_cups(sigma_px_m, fit.rms_m[chosen], fit.support[chosen], curved, fit.room[chosen] < 1, tool.cups)
     return [
         Grasp(T_bin_tcp=T_bin_tcp[n], tool=tool.number, part_id=label, open_m=0.0, close_m=0.0, quality=0.0,
               seal_m=float(fit.bend_m[i]), room=float(fit.room[i]), sigma_xy_m=float(off.xy_m[n]), sigma_z_m=float(off.z_m[n]),

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from rich.table import Table
 
 from binpick import geometry
@@ -12,7 +12,7 @@ from binpick.geometry import Transform, Vector
 from binpick.lab import grasps
 from binpick.lab.exam import Paper
 from binpick.result import CycleResult, GraspMessage
-from binpick.settings import SuctionTool
+from binpick.settings import Cup, SuctionTool
 from binpick.sim import pinch
 from binpick.sim.mesh import Caster
 from binpick.sim.score import Verdict
@@ -35,7 +35,7 @@ def in_sigmas(paper: Paper, outcome: CycleResult, grasp: GraspMessage, verdict: 
     if isinstance(tool, SuctionTool):
         eye = geometry.inverse(paper.inputs.job.bin.T_parent_bin)[:3, 3]
         along = verdict.distance_m
-        across = _beside(caster, taken.T_bin_tcp, eye, max(np.hypot(c.x_m, c.y_m) + c.radius_m for c in tool.cups))
+        across = _beside(caster, taken.T_bin_tcp, eye, tool)
     else:
         met = pinch.close(caster, taken.T_bin_tcp, tool.fingers, taken.open_m)
         seen = outcome.segments.part_points[grasp.part_id] if outcome.segments is not None else np.zeros((0, 3), np.float32)
@@ -43,28 +43,36 @@ def in_sigmas(paper: Paper, outcome: CycleResult, grasp: GraspMessage, verdict: 
     return abs(along) / grasp.sigma.z_m, across / grasp.sigma.xy_m, verdict.angle_rad / grasp.sigma.tilt_rad
 
 
-def _beside(caster: Caster, T_bin_tcp: Transform, eye: Vector, radius_m: float) -> float:
-    """Distance across the approach from the lip's middle to where it would lie, had everything been seen as it is.
+def _beside(caster: Caster, T_bin_tcp: Transform, eye: Vector, tool: SuctionTool) -> float:
+    """Distance across the approach from the TCP to where it would lie, had everything been seen as it is.
 
     Two ways to be off: the surface seen at the TCP truly lies nearer or further along the camera's ray, and the middle of what
-    the part truly shows around the lip lies elsewhere.
+    the part truly shows around the lips lies elsewhere.
     """
     at = T_bin_tcp[:3, 3]
     ray = (at - eye) / np.linalg.norm(at - eye)
     seen = caster.cast(np.concatenate([eye, ray])[None].astype(np.float32))
     depth = float(seen.distance[0]) - float(np.linalg.norm(at - eye))
-    side = SKIRT * radius_m * np.linspace(-1, 1, ACROSS)
-    x, y = (grid.ravel() for grid in np.meshgrid(side, side))
-    # a hair more, so that rounding leaves the disc symmetric
-    disc = np.hypot(x, y) <= SKIRT * radius_m * (1 + 1e-9)
-    x, y = x[disc], y[disc]
-    starts = geometry.transform(T_bin_tcp, np.column_stack([x, y, np.full(len(x), -START_M)]))
-    hits = caster.cast(np.column_stack([starts, np.tile(T_bin_tcp[:3, 2], (len(x), 1))]).astype(np.float32))
-    middle = int(np.hypot(x, y).argmin())
-    level = hits.distance - hits.distance[middle]
-    face = (hits.part_id == hits.part_id[middle]) & (np.abs(level) < FACE_M)
-    off = (T_bin_tcp[:3, :3].T @ ray)[:2] * depth + [x[face].mean(), y[face].mean()]
+    middles = [_face(caster, T_bin_tcp, cup) for cup in tool.cups]
+    aside = np.concatenate(middles).mean(axis=0)
+    off = (T_bin_tcp[:3, :3].T @ ray)[:2] * depth + aside
     return float(np.hypot(*off))
+
+
+def _face(caster: Caster, T_bin_tcp: Transform, cup: Cup) -> Float64[np.ndarray, "n 2"]:
+    """Where around a cup, counted from its middle, the face goes on that its middle stands on."""
+    reach = SKIRT * cup.radius_m
+    side = reach * np.linspace(-1, 1, ACROSS)
+    around = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    # a hair more, so that rounding leaves the disc symmetric
+    around = around[np.hypot(*around.T) <= reach * (1 + 1e-9)]
+    lip = around + np.array([cup.x_m, cup.y_m])
+    starts = geometry.transform(T_bin_tcp, np.column_stack([lip, np.full(len(lip), -START_M)]))
+    hits = caster.cast(np.column_stack([starts, np.tile(T_bin_tcp[:3, 2], (len(around), 1))]).astype(np.float32))
+    middle = int(np.hypot(*around.T).argmin())
+    on_face = (hits.part_id == hits.part_id[middle]) & (np.abs(hits.distance - hits.distance[middle]) < FACE_M)
+    face: Float64[np.ndarray, "n 2"] = around[on_face]
+    return face
 
 
 def _higher(caster: Caster, T_bin_tcp: Transform, seen: Float32[np.ndarray, "n 3"], part_id: int) -> float:
