@@ -26,7 +26,7 @@ from binpick.scene.location import Location
 from binpick.settings import Job
 
 REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
-           "collide", "history")
+           "uncertain", "aslant", "wrist", "collide", "history")
 """Counts of tries that fell out; the largest dominates the funnel."""
 
 
@@ -80,6 +80,10 @@ def code_of(filled: load_carrier.Filling, counts: dict[str, int], messages: tupl
         return Code.ALL_OUT_OF_REACH
     if counts.get("history"):
         return Code.ALL_BLOCKED_BY_HISTORY
+    if not counts["collide"] and counts["uncertain"]:
+        return Code.ALL_UNCERTAIN
+    if not counts["collide"] and counts["aslant"] + counts["wrist"]:
+        return Code.ALL_OUT_OF_REACH
     if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
     if filled.proved_empty:

@@ -13,7 +13,7 @@ from binpick.answer import answer, code_of, publishable
 from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
-from binpick.grasp import clearance, fingers, memory, rank, suction
+from binpick.grasp import admission, clearance, fingers, memory, rank, sigma, suction, wrist
 from binpick.result import (
     CycleInput,
     CycleResult,
@@ -92,9 +92,13 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     with clock.stage("grasp"):
         scene = clearance.obstacles(heights, job.bin)
         found, counts = _candidates(segments, grid.sigma_z_m, scene, job)
+        if (inputs.request.frame or job.recipe.frame) == "base":
+            found = sigma.calibrated(found, inputs.rig, frames.T_camera_bin)
+        found, limited = admission.admitted(found, job)
     with clock.stage("clearance"):
         kept, clear_counts = _clear(found, segments, heights, scene, inputs)
-    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **clear_counts}
+    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **limited,
+              **clear_counts}
     messages, gate_counts = publishable(kept, inputs, frames)
     counts |= gate_counts
     code = code_of(filled, counts, messages)
@@ -125,8 +129,11 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
     job, wanted = inputs.job, inputs.request.max_grasps or inputs.job.recipe.max_grasps
     free: list[Grasp] = []
     for tool in job.tools:
-        mine = [grasp for grasp in found if grasp.tool == tool.number]
-        free += [grasp for grasp, hit in zip(mine, clearance.blocked(mine, tool, heights), strict=True) if not hit]
+        mine = [wrist.equivalents(grasp, tool) for grasp in found if grasp.tool == tool.number]
+        whose = [number for number, ways in enumerate(mine) for _ in ways]
+        hits = clearance.blocked([turned for ways in mine for turned in ways], tool, heights).tolist()
+        some = {number for number, hit in zip(whose, hits, strict=True) if not hit}
+        free += [ways[0] for number, ways in enumerate(mine) if number in some]
     collide, looked = len(found) - len(free), 0
     kept: list[Grasp] = []
     ordered, blocked = memory.weighed(rank.ordered(free, segments, *job.tools), inputs.memory)
@@ -135,11 +142,13 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
             break
         if rank.adds(grasp, kept):
             looked += 1
-            distance_m = clearance.clearance(grasp, job.tool_numbered(grasp.tool), scene)
-            if distance_m < job.recipe.limits.margin_m:
+            tool = job.tool_numbered(grasp.tool)
+            ways = (replace(turned, clearance_m=clearance.clearance(turned, tool, scene))
+                    for turned in wrist.equivalents(grasp, tool))
+            if (clear := next((way for way in ways if way.clearance_m >= job.recipe.limits.margin_m), None)) is None:
                 collide += 1
             else:
-                kept.append(replace(grasp, clearance_m=distance_m))
+                kept.append(clear)
     return kept, {"collide": collide, "history": blocked, "clear": len(kept)}
 
 

@@ -66,11 +66,17 @@ class ReturnCode(Wire):
 
 
 class Sigma(Wire):
-    """1-sigma uncertainty of a grasp from depth noise."""
+    """1-sigma uncertainty of a grasp: the true error is within it in about 7 of 10 cases, within twice of it in 19 of 20.
+
+    From depth; of poses in `base` also from the calibration, as far as the rig file says how good it is.
+    """
 
     xy_m: float
+    """Across the approach; two fingers: along the closing direction, of the middle between both contacts."""
     z_m: float
+    """Along the approach; two fingers: of the part between them."""
     tilt_rad: float
+    """Between the approach and the surface's normal; two fingers: between the closing direction and the contacts."""
 
 
 class ToolMessage(Wire):
