@@ -3,7 +3,7 @@
 from dataclasses import asdict
 
 from binpick import geometry
-from binpick.data import Grasp
+from binpick.data import Grasp, PartPose
 from binpick.errors import Code
 from binpick.frames import Frames
 from binpick.geometry import Transform
@@ -14,6 +14,7 @@ from binpick.result import (
     Funnel,
     GraspMessage,
     Inputs,
+    PartMessage,
     RecipeMessage,
     Result,
     ReturnCode,
@@ -64,6 +65,19 @@ def _message(grasp: Grasp, inputs: CycleInput, T_frame_bin: Transform, number: i
         T_frame_pregrasp=_pose(T_frame_tcp @ geometry.translation(0.0, 0.0, -tool.approach_m)), approach_m=tool.approach_m,
         lift_m=tool.lift_m, open_m=grasp.open_m, close_m=grasp.close_m, quality=grasp.quality, part_id=grasp.part_id,
         sigma=Sigma(xy_m=grasp.sigma_xy_m, z_m=grasp.sigma_z_m, tilt_rad=grasp.sigma_tilt_rad), clearance_m=grasp.clearance_m)
+
+
+def part_messages(parts: tuple[PartPose, ...], inputs: CycleInput, frames: Frames) -> tuple[PartMessage, ...]:
+    """Parts in the frame asked for; one whose pose would not pass as a pose has none."""
+    mesh = inputs.job.recipe.mesh
+    if mesh is None:
+        return ()
+    frame = inputs.request.frame or inputs.job.recipe.frame
+    T_frame_bin = frames.T_frame_bin(frame)
+    poses = [part.T_bin_part if part.T_bin_part is not None and geometry.is_rigid(part.T_bin_part) else None for part in parts]
+    return tuple(PartMessage(id=part.part_ids[0], part_ids=part.part_ids, label=mesh.file.stem, frame=frame, score=part.score,
+                             T_frame_part=None if T is None else _pose(T_frame_bin @ T))
+                 for part, T in zip(parts, poses, strict=True))
 
 
 def _pose(T: Transform) -> PoseMessage:

@@ -112,6 +112,24 @@ class GraspMessage(Wire):
         return int(self.id.rsplit("-", 1)[1])
 
 
+class PartMessage(Wire):
+    """A part that the recipe's mesh was laid onto: where the mesh's frame lies, null when that is not sure.
+
+    Of poses that look alike by the part's symmetry it is the one turned least in the bin.
+    """
+
+    id: int
+    """The `part_id` of its grasps."""
+    part_ids: tuple[int, ...]
+    """All `part_id`s that are of this part: it may have come out in pieces."""
+    label: str
+    """The name of the mesh file, without its ending."""
+    frame: FrameName
+    score: Annotated[float, Field(ge=0, le=1)]
+    """How well mesh and measurement explain each other."""
+    T_frame_part: PoseMessage | None
+
+
 class Funnel(Wire):
     """How many candidates each stage left, and why most of the others fell out ("" when none did)."""
 
@@ -158,6 +176,8 @@ class Result(Wire):
     return_code: ReturnCode
     bin: BinMessage | None
     grasps: tuple[GraspMessage, ...] = ()
+    parts: tuple[PartMessage, ...] = ()
+    """With a mesh: parts in the order of their grasps. They say where a part lies; only `grasps` are to be moved by."""
     funnel: Funnel | None = None
     sync: SyncMessage | None = None
     timing_ms: dict[str, float] = Field(default_factory=dict)
@@ -237,6 +257,7 @@ class CycleResult:
     segments: Segments | None = None
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
+    T_camera_bin: Transform | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from binpick.data import BLACK_PATTERN, FIRST_GRAY_PATTERN, Light
 from binpick.geometry import Transform, Vector
 from binpick.settings.base import Number, Placement, Position, Strict
+from binpick.settings.mesh import Mesh
 from binpick.settings.stereo import PRESETS, Stereo
 
 Length = Annotated[float, Field(ge=0.02, le=3)]
@@ -148,6 +149,8 @@ class Recipe(Strict):
     """The tools to pick with, of which each grasp names the one it is for; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
+    mesh: Mesh | None = None
+    """The part's CAD model; with it the result says where each part lies and how it is turned."""
     stereo: Stereo = PRESETS["quality"]
     """How disparity is found: `quality`, `fast`, or settings of your own."""
     segment: SegmentSettings = SegmentSettings()
