@@ -3,22 +3,21 @@
 from dataclasses import asdict
 
 from binpick import geometry
-from binpick.data import Grasp
+from binpick.data import Grasp, PartPose
 from binpick.errors import Code
 from binpick.frames import Frames
 from binpick.geometry import Transform
 from binpick.grasp import gate
-from binpick.message import BinMessage, FillCellMessage, PoseMessage, RimMessage
+from binpick.message import BinMessage, FillCellMessage, PoseMessage, RecipeMessage, RimMessage, SyncMessage
 from binpick.result import (
     CycleInput,
     Funnel,
     GraspMessage,
     Inputs,
-    RecipeMessage,
+    PartMessage,
     Result,
     ReturnCode,
     Sigma,
-    SyncMessage,
     ToolMessage,
 )
 from binpick.scene import bin as load_carrier
@@ -26,7 +25,7 @@ from binpick.scene.location import Location
 from binpick.settings import Job
 
 REASONS = ("rim_not_on_one_part", "no_seal", "tilt", "outside_stroke", "not_parallel", "covered", "no_room",
-           "collide", "history")
+           "uncertain", "aslant", "wrist", "collide", "history")
 """Counts of tries that fell out; the largest dominates the funnel."""
 
 
@@ -66,6 +65,19 @@ def _message(grasp: Grasp, inputs: CycleInput, T_frame_bin: Transform, number: i
         sigma=Sigma(xy_m=grasp.sigma_xy_m, z_m=grasp.sigma_z_m, tilt_rad=grasp.sigma_tilt_rad), clearance_m=grasp.clearance_m)
 
 
+def part_messages(parts: tuple[PartPose, ...], inputs: CycleInput, frames: Frames) -> tuple[PartMessage, ...]:
+    """Parts in the frame asked for; one whose pose would not pass as a pose has none."""
+    mesh = inputs.job.recipe.mesh
+    if mesh is None:
+        return ()
+    frame = inputs.request.frame or inputs.job.recipe.frame
+    T_frame_bin = frames.T_frame_bin(frame)
+    poses = [part.T_bin_part if part.T_bin_part is not None and geometry.is_rigid(part.T_bin_part) else None for part in parts]
+    return tuple(PartMessage(id=part.part_ids[0], part_ids=part.part_ids, label=mesh.file.stem, frame=frame, score=part.score,
+                             T_frame_part=None if T is None else _pose(T_frame_bin @ T))
+                 for part, T in zip(parts, poses, strict=True))
+
+
 def _pose(T: Transform) -> PoseMessage:
     x, y, z = T[:3, 3].tolist()
     qx, qy, qz, qw = geometry.quaternion(T).tolist()
@@ -80,6 +92,10 @@ def code_of(filled: load_carrier.Filling, counts: dict[str, int], messages: tupl
         return Code.ALL_OUT_OF_REACH
     if counts.get("history"):
         return Code.ALL_BLOCKED_BY_HISTORY
+    if not counts["collide"] and counts["uncertain"]:
+        return Code.ALL_UNCERTAIN
+    if not counts["collide"] and counts["aslant"] + counts["wrist"]:
+        return Code.ALL_OUT_OF_REACH
     if counts["collide"] or counts.get("no_room") or counts.get("covered"):
         return Code.ALL_COLLIDE
     if filled.proved_empty:

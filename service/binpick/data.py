@@ -182,6 +182,18 @@ class Segments:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PartPose:
+    """What some segments were found to be: a part of the recipe's mesh at `T_bin_part`, or None when that is not sure.
+
+    `part_ids` are the labels of the segments, the one that was looked at first; `score` is 0 to 1.
+    """
+
+    part_ids: tuple[int, ...]
+    T_bin_part: Transform | None
+    score: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Grasp:
     """A candidate while it is being judged; T_bin_tcp as in a published pose, z into the object.
 

@@ -65,3 +65,21 @@ class BinMessage(Wire):
     coverage: float | None
     cells: tuple[FillCellMessage, ...] = ()
     rim: RimMessage | None = None
+
+
+class SyncMessage(Wire):
+    """How well the two images are proved to show one instant."""
+
+    skew_us: float
+    sigma_us: float
+    proof: str
+    resends: int
+    missing: int
+
+
+class RecipeMessage(Wire):
+    """The recipe a cycle worked by."""
+
+    number: int
+    name: str
+    sha256: str

@@ -1,7 +1,7 @@
 """The order of the stages: one pure function from a cycle's input to its result."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -9,11 +9,26 @@ import numpy as np
 from jaxtyping import Float32
 
 from binpick import geometry
-from binpick.answer import answer, code_of, publishable
-from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, Rectified, Segments
+from binpick.answer import answer, code_of, part_messages, publishable
+from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, PartPose, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
-from binpick.grasp import clearance, fingers, memory, rank, suction, verification
+from binpick.geometry import Transform, Vector
+from binpick.grasp import (
+    admission,
+    cad,
+    clearance,
+    fingers,
+    memory,
+    rank,
+    shape,
+    sight,
+    sigma,
+    suction,
+    taught,
+    verification,
+    wrist,
+)
 from binpick.result import (
     CycleInput,
     CycleResult,
@@ -34,6 +49,9 @@ LEAST_MEASURED = 0.20
 MOST_LOOKED_AT = 80
 """So many of the best grasps get an exact look at what their tool would hit."""
 
+POSE_M = 0.0025
+"""Parts may seem to lie this deep in the bin's floor or walls."""
+
 Proceed = Callable[[], None]
 
 
@@ -52,6 +70,27 @@ def run(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
 
     Raises InputError for images that do not belong to the rig; a bad scene is a return code.
     """
+    return poses(inputs, grasps(inputs, proceed), proceed)
+
+
+def poses(inputs: CycleInput, cycle: CycleResult, proceed: Proceed = lambda: None) -> CycleResult:
+    """The same cycle with its parts' poses, if the recipe has a mesh and they were not needed for its grasps."""
+    mesh, segments = inputs.job.recipe.mesh, cycle.segments
+    if mesh is None or mesh.grasps or segments is None or cycle.rectified is None or cycle.T_camera_bin is None:
+        return cycle
+    clock = _Clock(proceed)
+    frames = replace(Frames.of(inputs), T_camera_bin=cycle.T_camera_bin)
+    with clock.stage("pose"):
+        ranked = (grasp.part_id for grasp in cycle.result.grasps)
+        parts = _located(inputs, cycle.T_camera_bin, cycle.rectified, segments, ranked)
+    was, spent = cycle.result.timing_ms, clock.spent()
+    times = {**was, **spent, "compute": round(was["compute"] + spent["compute"], 3)}
+    messages = part_messages(parts, inputs, frames)
+    return replace(cycle, result=cycle.result.model_copy(update={"parts": messages, "timing_ms": times}))
+
+
+def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
+    """The cycle up to its grasps, which do not wait for poses that they do not need. Raises like `run`."""
     admit(inputs.rig, inputs.job, inputs.request)
     clock = _Clock(proceed)
     frames = Frames.of(inputs)
@@ -82,7 +121,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
                        segmentation.box(job.bin, job.recipe.limits.above_rim_m))
         heights = heightmap.height_map(grid.xyz, job.bin)
         filled = load_carrier.filling(heights, job.bin, job.recipe.part)
-    seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points)
+    seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points,
+                       T_camera_bin=frames.T_camera_bin)
     if measured < LEAST_MEASURED:
         return seen
     with clock.stage("memory"):
@@ -93,13 +133,25 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     with clock.stage("grasp"):
         scene = clearance.obstacles(heights, job.bin)
         found, counts = _candidates(segments, grid.sigma_z_m, scene, job)
+    parts: tuple[PartPose, ...] = ()
+    if job.recipe.mesh is not None and job.recipe.mesh.grasps:
+        with clock.stage("pose"):
+            ranked = (grasp.part_id for grasp in rank.ordered(found, segments, *job.tools))
+            parts = _located(inputs, frames.T_camera_bin, rectified, segments, ranked)
+            more, reasons = taught.candidates(parts, job.recipe.mesh, job.tools, segments, scene)
+            found, counts = found + more, _summed(counts, reasons)
+    if (inputs.request.frame or job.recipe.frame) == "base":
+        found = sigma.calibrated(found, inputs.rig, frames.T_camera_bin)
+    found, limited = admission.admitted(found, job)
     with clock.stage("clearance"):
         kept, clear_counts = _clear(found, segments, heights, scene, inputs)
-    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **clear_counts}
+    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **limited,
+              **clear_counts}
     messages, gate_counts = publishable(kept, inputs, frames)
     counts |= gate_counts
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
+    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames)})
     T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
     return replace(seen, result=result, segments=segments, verified=verdicts,
                    memory=memory.looked(inputs, result.grasps, T_bin_frame, heights, segments))
@@ -116,8 +168,30 @@ def _candidates(segments: Segments, sigma_z_m: Float32[np.ndarray, "h w"], scene
         else:
             found, reasons = fingers.candidates(segments, tool, sigma_z_m, scene, job.recipe.limits.margin_m)
         grasps += found
-        counts |= {reason: count + counts.get(reason, 0) for reason, count in reasons.items()}
+        counts = _summed(counts, reasons)
     return grasps, counts
+
+
+def _summed(counts: dict[str, int], more: dict[str, int]) -> dict[str, int]:
+    return counts | {reason: count + counts.get(reason, 0) for reason, count in more.items()}
+
+
+def _located(inputs: CycleInput, T_camera_bin: Transform, rectified: Rectified, segments: Segments, ranked: Iterable[int],
+             ) -> tuple[PartPose, ...]:
+    """The poses of the recipe's number of parts: those with grasps in their order, then the surest and highest."""
+    mesh = inputs.job.recipe.mesh
+    assert mesh is not None
+    height = {label: round(float(points[:, 2].mean()), 3) for label, points in segments.part_points.items()}
+    rest = sorted(height, key=lambda label: (-segments.part_confidence[label] * height[label], label))
+    seen = sight.Sight.of(segments, rectified, geometry.inverse(T_camera_bin))
+    return cad.locate(shape.load(mesh), seen, segments, dict.fromkeys([*ranked, *rest]), mesh.poses, _room(inputs.job))
+
+
+def _room(job: Job) -> tuple[Vector, Vector]:
+    """The corners of the bin's inside, as far out as poses err."""
+    length, width, _ = job.bin.inner_size_m
+    side = np.array([length / 2, width / 2]) + POSE_M
+    return np.array([*-side, -POSE_M]), np.array([*side, np.inf])
 
 
 def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: clearance.Obstacles, inputs: CycleInput,
@@ -126,8 +200,11 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
     job, wanted = inputs.job, inputs.request.max_grasps or inputs.job.recipe.max_grasps
     free: list[Grasp] = []
     for tool in job.tools:
-        mine = [grasp for grasp in found if grasp.tool == tool.number]
-        free += [grasp for grasp, hit in zip(mine, clearance.blocked(mine, tool, heights), strict=True) if not hit]
+        mine = [wrist.equivalents(grasp, tool) for grasp in found if grasp.tool == tool.number]
+        whose = [number for number, ways in enumerate(mine) for _ in ways]
+        hits = clearance.blocked([turned for ways in mine for turned in ways], tool, heights).tolist()
+        some = {number for number, hit in zip(whose, hits, strict=True) if not hit}
+        free += [ways[0] for number, ways in enumerate(mine) if number in some]
     collide, looked = len(found) - len(free), 0
     kept: list[Grasp] = []
     ordered, blocked = memory.weighed(rank.ordered(free, segments, *job.tools), inputs.memory)
@@ -136,11 +213,13 @@ def _clear(found: list[Grasp], segments: Segments, heights: HeightMap, scene: cl
             break
         if rank.adds(grasp, kept):
             looked += 1
-            distance_m = clearance.clearance(grasp, job.tool_numbered(grasp.tool), scene)
-            if distance_m < job.recipe.limits.margin_m:
+            tool = job.tool_numbered(grasp.tool)
+            ways = (replace(turned, clearance_m=clearance.clearance(turned, tool, scene))
+                    for turned in wrist.equivalents(grasp, tool))
+            if (clear := next((way for way in ways if way.clearance_m >= job.recipe.limits.margin_m), None)) is None:
                 collide += 1
             else:
-                kept.append(replace(grasp, clearance_m=distance_m))
+                kept.append(clear)
     return kept, {"collide": collide, "history": blocked, "clear": len(kept)}
 
 

@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from binpick import geometry
 from binpick.errors import RigError
@@ -51,12 +52,22 @@ class RigCamera(Part):
 
 
 class Quality(Part):
-    """How well the calibration fits: residuals in px, and which views were not used and why."""
+    """How well the calibration fits: residuals in px, and which views were not used and why.
+
+    `hand_eye_rms_m` and `hand_eye_rms_rad`: how well T_base_rig or T_flange_rig agree with the robot, absent if never measured.
+    """
 
     rms_px: float
     row_error_px: float
+    hand_eye_rms_m: Annotated[float, Field(ge=0)] | None = None
+    hand_eye_rms_rad: Annotated[float, Field(ge=0)] | None = None
     per_view_px: dict[str, float] = {}
     rejected: dict[str, str] = {}
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: Callable[["Quality"], dict[str, Any]]) -> dict[str, Any]:
+        """What a file does not say stays out of its checksum."""
+        return {key: value for key, value in handler(self).items() if value is not None}
 
 
 class Rig(Part):

@@ -10,6 +10,9 @@ from binpick.grasp import clearance, gate, rank, suction
 from binpick.result import GraspMessage, PoseMessage, Sigma, ToolMessage
 from binpick.scene import heightmap, segment
 from binpick.scene.surface import surface
+from binpick.settings import SuctionTool
+from binpick.settings.recipe import TiltLimit
+from binpick.settings.tool import Cup, Wrist
 from binpick.stereo import cloud
 
 
@@ -124,6 +127,11 @@ def test_the_last_gate(job, changes, objection):
     assert gate.objection(message(**changes), np.eye(4), np.eye(4), job.bin, job.tool, limits) == objection
 
 
+def test_the_last_gate_knows_the_robots_cone(job):
+    limits = job.recipe.limits.model_copy(update={"tilt": TiltLimit(towards=(0.5, 0.0, -1.0), max_rad=0.3)})
+    assert gate.objection(message(), np.eye(4), np.eye(4), job.bin, job.tool, limits) == "tilt"
+
+
 def test_the_last_gate_stops_what_is_not_finite(job):
     nan = message().model_copy(update={"position_m": (float("nan"), 0.0, 0.0)})
     assert gate.objection(nan, np.eye(4), np.eye(4), job.bin, job.tool, job.recipe.limits) == "not_finite"
@@ -153,3 +161,45 @@ def test_a_lip_sits_in_the_middle_of_a_narrow_face(plant, slab, aside_m):
     _, segments, grasps, _ = found(planted)
     best = rank.rank(grasps, segments, planted.job.tool)[0]
     assert abs(best.T_bin_tcp[1, 3] - aside_m) < 0.0004
+
+
+ROW = SuctionTool(cups=(Cup(x_m=0.018), Cup(x_m=-0.018)), wrist=Wrist(symmetry=2))
+
+
+def by_row(planted, tool=ROW):
+    grid = surface(planted.depth, planted.rectified, planted.T_bin_camera)
+    segments = segment.segment(grid, planted.job.bin, planted.job.recipe.part, planted.job.recipe.segment)
+    return suction.candidates(segments, tool, grid.sigma_z_m)
+
+
+def test_a_row_of_cups_is_laid_along_the_part_with_every_lip_on_it(plant, slab):
+    grasps, _ = by_row(plant([slab(0.0, 0.0, 0.07, 0.03, 0.05), slab(0.0, 0.06, 0.07, 0.03, 0.05)], noise_px=0.1))
+    assert {grasp.part_id for grasp in grasps} == {1, 2}
+    for grasp in grasps:
+        assert abs(grasp.T_bin_tcp[0, 0]) > 0.95, "square to the part the outer lips would hang beside it"
+        lips = geometry.transform(grasp.T_bin_tcp, np.array([[0.018, 0.0, 0.0], [-0.018, 0.0, 0.0]]))
+        assert (np.abs(lips[:, 0]) < 0.0285).all()
+        assert (np.abs(lips[:, 2] - 0.05) < 0.0006).all()
+
+
+def test_a_row_of_cups_is_also_tried_square_to_the_part(plant, slab):
+    grasps, _ = by_row(plant([slab(0.0, 0.0, 0.07, 0.06, 0.05)], noise_px=0.1))
+    along = [abs(grasp.T_bin_tcp[0, 0]) > 0.95 for grasp in grasps]
+    assert any(along)
+    assert not all(along)
+
+
+def test_no_row_of_cups_fits_a_part_that_one_cup_holds(plant, slab):
+    planted = plant([slab(0.0, 0.0, 0.036, 0.036, 0.05), slab(0.0375, 0.0, 0.036, 0.036, 0.051)], noise_px=0.1)
+    *_, single, _ = found(planted)
+    assert single
+    grasps, counts = by_row(planted)
+    assert not grasps, "one lip would lie on the neighbour, or on the edge"
+    assert counts["rim_not_on_one_part"] == counts["spots"]
+
+
+def test_two_lips_are_more_certain_than_one(plant, slab):
+    planted = plant([slab(0.0, 0.0, 0.07, 0.03, 0.05)], noise_px=0.15)
+    *_, single, _ = found(planted)
+    grasps, _ = by_row(planted)
+    assert np.mean([grasp.sigma_tilt_rad for grasp in grasps]) < np.mean([grasp.sigma_tilt_rad for grasp in single])

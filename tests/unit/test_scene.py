@@ -139,6 +139,22 @@ def test_a_concave_crease_separates_two_parts_and_a_convex_one_two_faces(plant, 
     assert faces[0][-1] != faces[1][-1]
 
 
+@pytest.mark.parametrize(("aside", "top", "own"), [(0, 0.06, True), (0.006, 0.06, False), (0, 0.03, False)],
+                         ids=["stem", "not flush", "low"])
+def test_a_stem_belongs_to_the_bar_it_stands_on_flush(plant, slab, aside, top, own):
+    segments = segmented(plant([slab(0, 0, 0.064, 0.016, 0.016), slab(0, aside, 0.016, 0.016, top)], noise_px=0.07))
+    left, stem, right = labels_at(segments, (-0.024, 0), (0, aside), (0.024, 0))
+    assert (left == stem == right) is own
+    assert (len(segments.part_confidence) == 1) is own
+
+
+@pytest.mark.parametrize(("length", "own"), [(0.04, True), (0.05, False)], ids=["flush", "not flush"])
+def test_a_steep_fold_is_within_a_part_where_both_sides_end_flush(plant, slab, length, own):
+    flanges = [slab(0, -0.012, 0.04, 0.024, 0.044, -0.75), slab(0, 0.012, length, 0.024, 0.044, 0.75)]
+    one, other = labels_at(segmented(plant(flanges, noise_px=0.07)), (0, -0.012), (0, 0.012))
+    assert (one == other) is own
+
+
 def test_a_leak_does_not_join_two_parts(plant, slab):
     # two plates of one height, 3 mm apart, bridged by a strip as wide as two pixels
     plates = [slab(-0.0415, 0, 0.08, 0.06, 0.03), slab(0.0415, 0, 0.08, 0.06, 0.03), slab(0, 0, 0.006, 0.0025, 0.03)]

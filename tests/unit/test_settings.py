@@ -44,8 +44,8 @@ def test_only_a_bin_is_required():
     (BIN + "recipes: [{shots: [{projector: false}, {}]}]\n", "the first must have the projector on"),
     (BIN + "recipes: [{projector: false, shots: [{pattern: 1}]}]\n", "a pattern needs the projector"),
     (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{shots: [{}, {}]}]\n", "are one shot, not 2"),
-    (BIN + "gripper: {cups: [{x_m: 0.01}]}\n", "tools.0.cups.0.x_m: .*less than or equal to 0"),
-    (BIN + "gripper: {wrist: {symmetry: 2}}\n", "wrist: unknown key"),
+    (BIN + "gripper: {cups: [{x_m: 0.01}]}\n", "the TCP must be the middle of the cups"),
+    (BIN + "gripper: {wrist: {turns: 2}}\n", "turns: unknown key"),
     (BIN.replace("[0, 0, 1]", "[0, 0, 1], rotvec_rad: [0, 0, 0], kuka_abc_deg: [0, 0, 0]"), "exactly one orientation"),
     (BIN.replace("[0, 0, 1]", "[0, 0, .nan]"), "finite"),
 ])

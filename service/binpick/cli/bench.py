@@ -137,3 +137,31 @@ def _latency(address: str, seconds: float = 20.0) -> dict[str, int | float]:
         return measure(host, int(port), seconds)
     except OSError as error:
         raise NotReady(f"no Modbus server answers at {address}: {error.strerror or error}") from error
+
+
+@bench.command()
+def pose(
+    world: Annotated[str, typer.Option(help="Exam world: A (6 mm lens, 600x400 mm bin) or B (12 mm lens, 300x200 mm).")] = "A",
+    scenes: Annotated[int, typer.Option(help="How many seeds from 101, or with --tuning from 1.", min=1, max=10)] = 10,
+    parts: Annotated[int, typer.Option(help="Parts per bin.", min=1, max=100)] = 25,
+    tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Poses by the parts' meshes: how far they are off, and how many parts have one, against the simulator's ground truth."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import track
+
+    from binpick.lab import poses
+    from binpick.sim import exam as frozen
+
+    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
+    total = (len(poses.BINS) + len(frozen.MIXTURES["mixed"]) - 1) * len(seeds)
+    console = Console(stderr=True)
+    sheets = list(track(poses.sit(world, seeds, parts), "Posing", total=total, console=console, transient=True))
+    run = poses.figures(world, parts, sheets)
+    if as_json:
+        typer.echo(json.dumps(run, indent=1))
+    else:
+        Console(width=190).print(poses.table(run))

@@ -151,7 +151,8 @@ def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
 
 def _foot_radius_m(tool: SuctionTool) -> float:
     """Radius of what comes down right above the lip."""
-    return max([tool.cups[0].radius_m] + [r for r, _, high in _extents(tool) if high > -0.01])
+    lips = [float(np.hypot(cup.x_m, cup.y_m)) + cup.radius_m for cup in tool.cups]
+    return max(lips + [r for r, _, high in _extents(tool) if high > -0.01])
 
 
 def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float) -> float:

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from binpick import geometry
 from binpick.data import Grasp, Segments
-from binpick.grasp import clearance, slices
+from binpick.grasp import clearance, sigma, slices
 from binpick.grasp.clearance import Obstacles
+from binpick.grasp.sigma import Sigmas
 from binpick.grasp.slices import Slices
 from binpick.settings import Fingers, TwoFingerTool
 
@@ -70,7 +71,8 @@ def candidates(segments: Segments, tool: TwoFingerTool, sigma_z_m: np.ndarray, s
     best = _best(cut, doubt, free)
     parts = segments.parts.ravel()
     sigma_m = np.bincount(parts, np.where(parts > 0, sigma_z_m.ravel(), 0)) / np.maximum(np.bincount(parts), 1)
-    return [_grasp(i, cut, room, float(doubt[i]), tool, float(sigma_m[cut.part[i]])) for i in best.tolist()], reasons
+    off = sigma.of_fingers(sigma_m[cut.part], _angle(cut))
+    return [_grasp(i, cut, room, float(doubt[i]), tool, off) for i in best.tolist()], reasons
 
 
 def _angle(cut: Slices) -> Float64[np.ndarray, "n"]:
@@ -150,7 +152,7 @@ def _doubt(cut: Slices, room: Room, covered: Float64[np.ndarray, "n"]) -> Float6
     return doubt
 
 
-def _grasp(i: int, cut: Slices, room: Room, doubt: float, tool: TwoFingerTool, sigma_z_m: float) -> Grasp:
+def _grasp(i: int, cut: Slices, room: Room, doubt: float, tool: TwoFingerTool, off: Sigmas) -> Grasp:
     R = cut.R_bin_tcp[i]
     local = np.array([(cut.low_m[i] + cut.high_m[i]) / 2, cut.across_m[i],
                       cut.deep_m[i] + room.grip[i] * tool.fingers.pad_depth_m])
@@ -160,5 +162,4 @@ def _grasp(i: int, cut: Slices, room: Room, doubt: float, tool: TwoFingerTool, s
     width = float(cut.width_m[i])
     return Grasp(T_bin_tcp=geometry.make(R, R @ local), tool=tool.number, part_id=int(cut.part[i]), quality=0.0,
                  open_m=width + 2 * float(room.gap_m[i]), close_m=width, seal_m=0.0, room=1.0, doubt=doubt,
-                 sigma_xy_m=float(np.hypot(sigma_z_m, cut.residual_m[i]) / 2), sigma_z_m=sigma_z_m,
-                 sigma_tilt_rad=float(cut.residual_m[i] / tool.fingers.pad_width_m))
+                 sigma_xy_m=float(off.xy_m[i]), sigma_z_m=float(off.z_m[i]), sigma_tilt_rad=float(off.tilt_rad[i]))

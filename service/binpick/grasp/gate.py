@@ -54,6 +54,7 @@ def objection(grasp: GraspMessage, T_bin_frame: Transform, T_reach_frame: Transf
         return "outside_bin"
     if (reach < limits.reach.min_m).any() or (reach > limits.reach.max_m).any():
         return "out_of_reach"
-    if np.arccos(np.clip(-T_bin_tcp[2, 2], -1, 1)) > tool.max_tilt_rad + TILT_RAD:
+    aslant = limits.tilt.angle(T_bin_tcp[:3, 2]) > limits.tilt.max_rad + TILT_RAD
+    if aslant or np.arccos(np.clip(-T_bin_tcp[2, 2], -1, 1)) > tool.max_tilt_rad + TILT_RAD:
         return "tilt"
     return ""

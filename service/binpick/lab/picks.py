@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from binpick import pipeline
-from binpick.lab import exam, grasps, parts
+from binpick.lab import exam, grasps, offsets, parts
 from binpick.lab.exam import Paper
 from binpick.lab.parts import PartScore
 from binpick.result import CycleResult
@@ -23,13 +23,14 @@ class Grip:
     """A published grasp as judged; `off_m` and `penetration_m` are the verdict's `distance_m` and `penetration_m`.
 
     Of suction, `off_m` is the error along the approach that `sigma_z_m` speaks of; of two fingers, by how much the part is
-    wider than said.
+    wider than said. `in_sigmas`: its errors as `offsets` tells them.
     """
 
     ok: bool
     penetration_m: float
     off_m: float
     sigma_z_m: float
+    in_sigmas: tuple[float, ...] = (np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,8 @@ def sheet(paper: Paper, kinds: str) -> Sheet:
 def _pick(tool: str, paper: Paper, outcome: CycleResult) -> Pick:
     published = outcome.result.grasps
     verdicts = grasps.judged(paper, [grasps.taken(grasp) for grasp in published])
-    grips = (Grip(verdict.ok, verdict.penetration_m, verdict.distance_m, grasp.sigma.z_m)
+    grips = (Grip(verdict.ok, verdict.penetration_m, verdict.distance_m, grasp.sigma.z_m,
+                  offsets.in_sigmas(paper, outcome, grasp, verdict))
              for verdict, grasp in zip(verdicts, published, strict=True))
     return Pick(tool, outcome.result.return_code.value, tuple(grips), outcome.result.timing_ms)
 

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from binpick.lab import exam, parts
+from binpick.lab import exam, offsets, parts
 from binpick.lab.parts import PartScore
 from binpick.lab.picks import KINDS, MIXES, Pick, Sheet
 from binpick.sim import exam as frozen
@@ -53,6 +53,7 @@ def row(tool: str, picks: Sequence[Pick]) -> Figures:
         "collisions": sum(depth > score.MAX_PENETRATION_M for depth in depths),
         "penetration_max_mm": round(1000 * max(depths, default=0.0), 2),
         "codes": {str(code): times for code, times in sorted(Counter(pick.code for pick in picks).items())},
+        "sigmas": offsets.within([grip.in_sigmas for pick in picks for grip in pick.grips if grip.ok]),
         "sigma_z": _sigma(picks) if tool == "suction" else None,
         "off_mm": _off(picks),
         "stages_ms": _stages(picks),
@@ -112,7 +113,7 @@ def tables(run: Figures) -> Group:
     whole = Table(f"parts seen {parts.PLAIN_VIEW:.0%} and more", f"one segment (IoU > {parts.HALF:.1f})", "share (95 %)")
     for mix, found in run["segments"].items():
         whole.add_row(mix, _of(found), _percent(found))
-    return Group(grips, OFF, whole, stages)
+    return Group(grips, OFF, offsets.table(run["tools"]), whole, stages)
 
 
 def _within(each: Figures) -> str:

@@ -13,6 +13,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from binpick.data import Labels, Mask
+from binpick.scene import prism
 from binpick.scene.contact import Contacts, Ways, contacts, ways
 from binpick.scene.surface import Surface
 from binpick.settings import SegmentSettings
@@ -53,7 +54,9 @@ def segment(surface: Surface, of_interest: Mask, settings: SegmentSettings) -> t
     borders = _without_specks(concave & of_interest, speck) | _without_specks(~of_interest, speck)
     regions = _grown(_cores(of_interest, borders, CORE_M / spacing_m), surface, of_interest, GROWTH_M / spacing_m)
     parts = _joined(regions, along, spacing_m)
-    return _faces(parts, concave | convex), parts
+    faces = _faces(parts, concave | convex)
+    group = _groups(int(parts.max(initial=0)) + 1, *prism.pairs(faces, parts, surface, spacing_m))
+    return faces, group.astype(np.int32)[parts]
 
 
 def spacing(surface: Surface, of_interest: Mask) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from binpick import geometry
 from binpick.data import Cloud, Depth, Mask, Rectified
@@ -30,15 +30,19 @@ Values = Float32[np.ndarray, "n"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Points and unit normals (towards the camera) in the bin's frame, NaN = not measured; sigma_z_m of one pixel."""
+    """Points and unit normals (towards the camera) in the bin's frame, NaN = not measured; sigma_z_m of one pixel.
+
+    `eyes` is where the two cameras stand: what is measured is seen by both.
+    """
 
     xyz: Cloud
     normal: Cloud
     sigma_z_m: Float32[np.ndarray, "h w"]
+    eyes: Float64[np.ndarray, "2 3"]
 
     def cut(self, box: tuple[slice, slice]) -> "Surface":
         """Its rows and columns in a box."""
-        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box])
+        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box], self.eyes)
 
 
 def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform, box_bin: Box | None = None) -> Surface:
@@ -64,7 +68,8 @@ def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform, box_bin
     normal = np.full((rows * cols, 3), np.nan, dtype=np.float32)
     normal[place] = geometry.rotate(T_bin_rect, np.stack([a * towards, b * towards, c * towards], axis=-1))
     sigma = z * z * sigma_px * np.float32(1 / (rectified.focal_px * rectified.baseline_m))
-    return Surface(xyz=xyz, normal=normal.reshape(xyz.shape), sigma_z_m=sigma)
+    eyes = geometry.transform(T_bin_rect, np.array([[0.0, 0, 0], [rectified.baseline_m, 0, 0]]))
+    return Surface(xyz=xyz, normal=normal.reshape(xyz.shape), sigma_z_m=sigma, eyes=eyes)
 
 
 def _inside(xyz: Cloud, box: Box) -> Mask:

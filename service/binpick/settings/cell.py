@@ -155,6 +155,10 @@ class Cell(Strict):
                 raise ValueError(f"recipe {recipe.number}: there is no bin {recipe.bin}")
             if missing := set(recipe.tools) - tools:
                 raise ValueError(f"recipe {recipe.number}: there is no tool {sorted(missing)}")
+            own = set(recipe.tools) or {self.tools[0].number}
+            if recipe.mesh is not None and (strange := {grasp.tool for grasp in recipe.mesh.grasps} - own):
+                raise ValueError(f"recipe {recipe.number}: mesh.grasps are for tool {sorted(strange)}, the recipe's are "
+                                 f"{sorted(own)}")
             if len(recipe.shots) > 1 and self.cameras.backend == "files":
                 raise ValueError(f"recipe {recipe.number}: two images from disk are one shot, not {len(recipe.shots)}")
         if self.control == "modbus" and self.publish.modbus is None:

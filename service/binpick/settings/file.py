@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from binpick.errors import SettingsError
 from binpick.settings.cell import Cell
+from binpick.settings.recipe import Recipe
 
 
 def load(path: Path) -> Cell:
@@ -22,7 +23,15 @@ def load(path: Path) -> Cell:
     if cell.cameras.backend == "files":
         changes["cameras"] = cell.cameras.model_copy(
             update={"left": path.parent / cell.cameras.left, "right": path.parent / cell.cameras.right})
+    changes["recipes"] = tuple(_beside(recipe, path.parent) for recipe in cell.recipes)
     return cell.model_copy(update=changes)
+
+
+def _beside(recipe: Recipe, folder: Path) -> Recipe:
+    """The recipe with its mesh's path resolved against a folder."""
+    if recipe.mesh is None:
+        return recipe
+    return recipe.model_copy(update={"mesh": recipe.mesh.model_copy(update={"file": folder / recipe.mesh.file})})
 
 
 def parse(text: str, name: str) -> Cell:

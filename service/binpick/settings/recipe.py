@@ -2,11 +2,13 @@
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from binpick.data import BLACK_PATTERN, FIRST_GRAY_PATTERN, Light
-from binpick.geometry import Transform
+from binpick.geometry import Transform, Vector
 from binpick.settings.base import Number, Placement, Position, Strict
+from binpick.settings.mesh import Mesh
 from binpick.settings.stereo import PRESETS, Stereo
 
 Length = Annotated[float, Field(ge=0.02, le=3)]
@@ -89,6 +91,37 @@ class Shot(Strict):
     The projector must step on at each strobe, in the recipe's order."""
 
 
+class SigmaLimits(Strict):
+    """The most a grasp's own uncertainty may be, 1 sigma; a grasp beyond any of these is not published."""
+
+    xy_m: Annotated[float, Field(ge=0.0001, le=0.1)] = 0.005
+    """Across the approach (two fingers: along the closing direction), metres."""
+    z_m: Annotated[float, Field(ge=0.0001, le=0.1)] = 0.005
+    """Along the approach, metres."""
+    tilt_rad: Annotated[float, Field(ge=0.001, le=1.6)] = 0.25
+    """Between the approach and the surface (two fingers: between the closing direction and the contacts), radians."""
+
+
+class TiltLimit(Strict):
+    """The cone of approaches that the robot can follow; each tool has a limit of its own from straight down besides."""
+
+    towards: Position = (0.0, 0.0, -1.0)
+    """The preferred approach, a direction in frame `bin`; straight down by default."""
+    max_rad: Annotated[float, Field(ge=0, le=np.pi)] = np.pi
+    """Largest angle to it, radians."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "TiltLimit":
+        if np.linalg.norm(self.towards) < 1e-6:
+            raise ValueError("towards must be a direction, not zero")
+        return self
+
+    def angle(self, approach_bin: Vector) -> float:
+        """Of an approach, a unit vector in frame `bin`, to the preferred one."""
+        towards = np.array(self.towards) / np.linalg.norm(self.towards)
+        return float(np.arccos(np.clip(towards @ approach_bin, -1, 1)))
+
+
 class Limits(Strict):
     """What is never published."""
 
@@ -98,6 +131,10 @@ class Limits(Strict):
     """How far above the rim parts are looked for, metres."""
     reach: Reach = Reach()
     """Where the robot can go."""
+    sigma: SigmaLimits = SigmaLimits()
+    """How uncertain a grasp may be."""
+    tilt: TiltLimit = TiltLimit()
+    """From where the robot can come."""
 
 
 class Recipe(Strict):
@@ -112,6 +149,8 @@ class Recipe(Strict):
     """The tools to pick with, of which each grasp names the one it is for; the first one of the cell when empty."""
     part: PartSize = PartSize()
     """What the parts are like."""
+    mesh: Mesh | None = None
+    """The part's CAD model; with it the result says where each part lies and how it is turned."""
     stereo: Stereo = PRESETS["quality"]
     """How disparity is found: `quality`, `fast`, or settings of your own."""
     segment: SegmentSettings = SegmentSettings()

@@ -7,16 +7,17 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from binpick.settings.base import Number, Placement, Strict
 
-OnTheTcp = Annotated[float, Field(ge=0, le=0)]
+Beside = Annotated[float, Field(ge=-0.5, le=0.5)]
+Angle = Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)]
 
 
 class Cup(Strict):
-    """A suction cup; the TCP is the centre of its lip."""
+    """A suction cup; its lip lies in the TCP's x-y plane."""
 
-    x_m: OnTheTcp = 0.0
-    """Centre along the TCP's x, metres; 0 while a tool has one cup."""
-    y_m: OnTheTcp = 0.0
-    """Centre along the TCP's y, metres; 0 while a tool has one cup."""
+    x_m: Beside = 0.0
+    """Centre along the TCP's x, metres; 0 for a single cup."""
+    y_m: Beside = 0.0
+    """Centre along the TCP's y, metres; 0 for a single cup."""
     radius_m: Annotated[float, Field(ge=0.001, le=0.1)] = 0.007
     """Lip radius, uncompressed, metres."""
 
@@ -73,6 +74,21 @@ class Fingers(Strict):
         return self
 
 
+class Wrist(Strict):
+    """How the tool may be turned about its approach."""
+
+    symmetry: Annotated[int, Field(ge=1, le=36)] = 1
+    """So many turns of equal angle make a full one, and after each the tool grips the same; 1: there is only one way."""
+    limits_rad: tuple[Angle, Angle] = (-np.pi, np.pi)
+    """Where the TCP's x may point as seen from above, lowest and highest angle from the bin's x, counterclockwise, radians."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "Wrist":
+        if self.limits_rad[0] >= self.limits_rad[1]:
+            raise ValueError("limits_rad: the first must be below the second")
+        return self
+
+
 class _Mounted(Strict):
     """What every tool has; z of the TCP points into the part, so bodies lie at negative z."""
 
@@ -85,17 +101,19 @@ class _Mounted(Strict):
     """Straight way up after gripping, metres."""
     max_tilt_rad: Annotated[float, Field(ge=0, le=np.pi / 2)] = 0.6
     """Largest angle between the approach and straight down into the bin, radians."""
+    wrist: Wrist = Wrist()
+    """Other ways to hold the same: tried when the first would collide, or is out of the wrist's limits."""
 
 
 class SuctionTool(_Mounted):
-    """A suction tool; the TCP is the centre of the uncompressed lip."""
+    """A suction tool; the TCP is the centre of the uncompressed lip, or the middle of several in one plane."""
 
     name: Annotated[str, Field(min_length=1, max_length=64)] = "suction"
     """For people."""
     kind: Literal["suction"] = "suction"
     """How it holds."""
-    cups: Annotated[tuple[Cup, ...], Field(min_length=1, max_length=1)] = (Cup(),)
-    """The cups."""
+    cups: Annotated[tuple[Cup, ...], Field(min_length=1, max_length=16)] = (Cup(),)
+    """The cups: all must seal on one part. Several are laid along the part's longest extent by the TCP's x, or square to it."""
     bodies: Bodies = (
         Cylinder(shape="cylinder", radius_m=0.009, length_m=0.018, T_tcp_body=Placement(position_m=(0, 0, -0.011))),
         Cylinder(shape="cylinder", radius_m=0.012, length_m=0.18, T_tcp_body=Placement(position_m=(0, 0, -0.11))),
@@ -106,6 +124,22 @@ class SuctionTool(_Mounted):
     """How far the robot's program presses beyond the pose, metres, as `binpick check` tells; poses lie on the surface."""
     compliance_m: Annotated[float, Field(ge=0.0002, le=0.01)] = 0.0012
     """How far the lip follows a surface that is not flat, metres, either way of its fitted plane."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "SuctionTool":
+        at = np.array([(cup.x_m, cup.y_m) for cup in self.cups])
+        if np.abs(at.mean(axis=0)).max() > 1e-4:
+            raise ValueError("cups: the TCP must be the middle of the cups' centres (a single cup: x_m and y_m 0)")
+        radii = np.array([cup.radius_m for cup in self.cups])
+        apart = np.linalg.norm(at[:, None] - at, axis=2)
+        if (apart < radii[:, None] + radii)[np.triu_indices(len(at), 1)].any():
+            raise ValueError("cups: no two may overlap")
+        turn = 2 * np.pi / self.wrist.symmetry
+        turned = at @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        same = np.linalg.norm(turned[:, None] - at, axis=2) + np.abs(radii[:, None] - radii) < 1e-4
+        if not same.any(axis=1).all():
+            raise ValueError(f"wrist.symmetry: the cups do not lie where others lay after 1/{self.wrist.symmetry} of a turn")
+        return self
 
 
 class TwoFingerTool(_Mounted):
@@ -119,11 +153,19 @@ class TwoFingerTool(_Mounted):
     """The TCP that the robot must be given, as `binpick check` tells; poses are of the TCP and do not depend on it."""
     fingers: Fingers = Fingers()
     """The fingers."""
+    wrist: Wrist = Wrist(symmetry=2)
+    """Half a turn is the same grip: tried when the first would collide, or is out of the wrist's limits."""
     bodies: Bodies = (
         Box(shape="box", size_m=(0.11, 0.05, 0.07), T_tcp_body=Placement(position_m=(0, 0, -0.095))),
         Cylinder(shape="cylinder", radius_m=0.04, length_m=0.06, T_tcp_body=Placement(position_m=(0, 0, -0.16))),
     )
     """Everything but the fingers that must not hit anything, a hand-mounted camera included."""
+
+    @model_validator(mode="after")
+    def _sound(self) -> "TwoFingerTool":
+        if self.wrist.symmetry > 2:
+            raise ValueError("wrist.symmetry: two fingers hold the same after half a turn (2), or not at all (1)")
+        return self
 
 
 def _kind(tool: Any) -> Any:

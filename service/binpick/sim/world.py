@@ -111,7 +111,7 @@ class World:
     def _fall(self, poses: dict[int, Transform]) -> dict[int, Transform]:
         if not poses:
             return {}
-        model = _model(self._setup, [self._kinds[i] for i in poses])
+        model = spec(self._setup, [self._kinds[i] for i in poses]).compile()
         data = mujoco.MjData(model)
         data.qpos[:] = np.concatenate([np.r_[T[:3, 3], geometry.quaternion(T)[[3, 0, 1, 2]]] for T in poses.values()])
         _rest(model, data)
@@ -139,7 +139,8 @@ def _is_calm(velocity: Float[np.ndarray, "n"]) -> bool:
     return bool(np.abs(v[:, 0]).max() < CALM_M_S and np.abs(v[:, 1]).max() < CALM_RAD_S)
 
 
-def _model(setup: exam.Setup, kinds: list[str]) -> mujoco.MjModel:
+def spec(setup: exam.Setup, kinds: list[str]) -> mujoco.MjSpec:
+    """The bin with guides above its walls, and these parts in this order, each on a free joint."""
     spec = mujoco.MjSpec()
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -153,7 +154,7 @@ def _model(setup: exam.Setup, kinds: list[str]) -> mujoco.MjModel:
         body.add_freejoint()
         for piece in exam.KINDS[kind].pieces:
             _add_piece(body, piece)
-    return spec.compile()
+    return spec
 
 
 def _add_bin(spec: mujoco.MjSpec, setup: exam.Setup) -> None:
