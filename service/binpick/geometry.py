@@ -86,8 +86,8 @@ def frame_of_axes(z: Vector, x_hint: Vector, origin: Vector) -> Transform:
 def hull_planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 4"]:
     """Outward unit normals n and levels h of planes around the points' convex hull: n · p <= h for each of the points.
 
-    Of sides within about 12° of each other one stands for all, moved out until it holds the points: round shapes have thousands,
-    and become a little larger.
+    Of sides within about 12° of each other one stands for all, moved out until it holds the points: round shapes have
+    thousands, and become a little larger.
     """
     normals = ConvexHull(points).equations[:, :3]
     _, first = np.unique(np.round(5 * normals), axis=0, return_index=True)

@@ -167,9 +167,10 @@ def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float)
     T_tcp_body, _ = _placed(body)
     if isinstance(body, Mesh):
         planes = _swept_planes(body, approach_m)
-        # by numpy itself: a BLAS product may round otherwise with another number of threads
-        away = sum(points[:, axis, None] * planes[:, axis] for axis in range(3)) - planes[:, 3]
-        return float(away.max(axis=1).min())
+        x, y, z = np.ascontiguousarray(points.T)
+        # side by side, without BLAS: its products may round otherwise with another number of threads
+        away = functools.reduce(np.maximum, (x * a + y * b + z * c - h for a, b, c, h in planes.tolist()))
+        return float(away.min())
     upright = abs(T_tcp_body[2, 2]) > 1 - 1e-9
     longer_m = approach_m if upright else 0.0
     steps = [approach_m / 2] if upright else np.linspace(0, approach_m, 1 + int(np.ceil(approach_m / SWEEP_STEP_M))).tolist()
