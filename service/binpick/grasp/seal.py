@@ -89,7 +89,7 @@ def seal(patch: Patch) -> Seal:
 
 
 def _sectors(patch: Patch, inner: float, outer: float, least: int = 2) -> Int32[np.ndarray, "n"]:
-    """In how many sectors of a ring around one cup on each spot the part's own points, at least so many, prevail; in lip radii."""
+    """In how many sectors of a ring around one cup on each spot at least so many own points prevail; radii in lip radii."""
     x, y = (patch.local[..., a] - patch.lip[:, a] for a in range(2))
     radial = patch.radial
     with np.errstate(invalid="ignore"):
