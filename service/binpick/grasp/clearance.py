@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Float64
 from binpick import geometry
 from binpick.data import Grasp, HeightMap, Segments
 from binpick.geometry import Transform, Vector
-from binpick.settings import Bin, Body, Box, SuctionTool, Tool
+from binpick.settings import Bin, Body, Box, Mesh, SuctionTool, Tool
 from binpick.settings.base import Placement
 
 PAD_M = 0.08
@@ -143,6 +143,8 @@ def _corners(body: Body) -> Float64[np.ndarray, "n 3"]:
     if isinstance(body, Box):
         half = np.array(body.size_m) / 2
         return geometry.box_corners(-half, half)
+    if isinstance(body, Mesh):
+        return body.corners_m
     angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     ring = body.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     half_length = body.length_m / 2
@@ -163,6 +165,12 @@ def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float)
     if not len(points):
         return float("inf")
     T_tcp_body, _ = _placed(body)
+    if isinstance(body, Mesh):
+        planes = _swept_planes(body, approach_m)
+        x, y, z = np.ascontiguousarray(points.T)
+        # side by side, without BLAS: its products may round otherwise with another number of threads
+        away = functools.reduce(np.maximum, (x * a + y * b + z * c - h for a, b, c, h in planes.tolist()))
+        return float(away.min())
     upright = abs(T_tcp_body[2, 2]) > 1 - 1e-9
     longer_m = approach_m if upright else 0.0
     steps = [approach_m / 2] if upright else np.linspace(0, approach_m, 1 + int(np.ceil(approach_m / SWEEP_STEP_M))).tolist()
@@ -182,6 +190,17 @@ def _distance(points: Float64[np.ndarray, "n 3"], body: Body, approach_m: float)
         outside = [np.maximum(away[near], 0) for away in beyond]
         nearest.append(float(np.sqrt(sum(away * away for away in outside).min(initial=np.inf))))
     return float(np.min(nearest))
+
+
+@functools.lru_cache(maxsize=64)
+def _swept_planes(body: Mesh, approach_m: float) -> Float64[np.ndarray, "k 4"]:
+    """Planes around a mesh' hull and all places that it passes on the approach, in the TCP's frame.
+
+    The largest distance from a plane is exact inside and never more than the true distance outside.
+    """
+    planes: Float64[np.ndarray, "k 4"] = geometry.hull_planes(_placed(body)[1])
+    planes[:, 3] += np.maximum(0, -planes[:, 2] * approach_m)
+    return planes
 
 
 def covered(segments: Segments, scene: Obstacles) -> dict[int, float]:
@@ -236,6 +255,9 @@ def _shell(tool: Tool) -> Float64[np.ndarray, "n 3"]:
     rings = []
     for body in tool.bodies:
         corners = _corners(body)
+        if isinstance(body, Mesh):
+            rings.append(_placed(body)[1])
+            continue
         low, high = corners[:, 2].min(), corners[:, 2].max()
         for share in np.linspace(0, 1, 1 + int(np.ceil((high - low) / 0.03))):
             ring = corners[corners[:, 2] == high].copy()

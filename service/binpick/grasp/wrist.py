@@ -8,7 +8,7 @@ import numpy as np
 from binpick import geometry
 from binpick.data import Grasp
 from binpick.geometry import Transform
-from binpick.settings import Body, Cylinder, Tool
+from binpick.settings import Body, Cylinder, Mesh, Tool
 
 
 def equivalents(grasp: Grasp, tool: Tool) -> list[Grasp]:
@@ -50,6 +50,8 @@ def _standing(body: Body, T: Transform) -> object:
     """Where a body stands to a micrometre: equal for a cylinder turned about its own axis, and a box by half a turn."""
     if isinstance(body, Cylinder):
         points = np.stack([T[:3, 3] + side * body.length_m / 2 * T[:3, 2] for side in (-1, 1)])
+    elif isinstance(body, Mesh):
+        points = geometry.transform(T, body.corners_m)
     else:
         half = np.array(body.size_m) / 2
         points = geometry.transform(T, geometry.box_corners(-half, half))

@@ -8,8 +8,11 @@ import yaml
 from pydantic import ValidationError
 
 from binpick.errors import SettingsError
+from binpick.settings import shape
 from binpick.settings.cell import Cell
 from binpick.settings.recipe import Recipe
+from binpick.settings.shape import Mesh
+from binpick.settings.tool import Tool
 
 
 def load(path: Path) -> Cell:
@@ -19,7 +22,7 @@ def load(path: Path) -> Cell:
     except (OSError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: the cell file cannot be read: {getattr(error, 'strerror', error)}") from error
     cell = parse(text, str(path))
-    changes: dict[str, Any] = {"rig": path.parent / cell.rig}
+    changes: dict[str, Any] = {"rig": path.parent / cell.rig, "tools": tuple(_shaped(tool, path.parent) for tool in cell.tools)}
     if cell.cameras.backend == "files":
         changes["cameras"] = cell.cameras.model_copy(
             update={"left": path.parent / cell.cameras.left, "right": path.parent / cell.cameras.right})
@@ -32,6 +35,14 @@ def _beside(recipe: Recipe, folder: Path) -> Recipe:
     if recipe.mesh is None:
         return recipe
     return recipe.model_copy(update={"mesh": recipe.mesh.model_copy(update={"file": folder / recipe.mesh.file})})
+
+
+def _shaped(tool: Tool, folder: Path) -> Tool:
+    """The tool with the meshes of its bodies read."""
+    if not any(isinstance(body, Mesh) for body in tool.bodies):
+        return tool
+    bodies = tuple(shape.read(body, folder) if isinstance(body, Mesh) else body for body in tool.bodies)
+    return tool.model_copy(update={"bodies": bodies})
 
 
 def parse(text: str, name: str) -> Cell:
@@ -59,7 +70,7 @@ SENTENCES = {"extra_forbidden": "unknown key", "union_tag_not_found": "say which
 
 
 def _say(name: str, tree: yaml.Node | None, item: Any) -> str:
-    loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder", "suction", "two_finger")]
+    loc = [part for part in item["loc"] if part not in ("aravis", "files", "box", "cylinder", "mesh", "suction", "two_finger")]
     key = ".".join(str(part) for part in loc)
     message = SENTENCES.get(item["type"], str(item["msg"]))
     given = f" (it is {item['input']!r})" if isinstance(item.get("input"), int | float | str) else ""

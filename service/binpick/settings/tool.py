@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from binpick.settings.base import Number, Placement, Strict
+from binpick.settings.shape import Bodies, Box, Cylinder
 
 Beside = Annotated[float, Field(ge=-0.5, le=0.5)]
 Angle = Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)]
@@ -20,33 +21,6 @@ class Cup(Strict):
     """Centre along the TCP's y, metres; 0 for a single cup."""
     radius_m: Annotated[float, Field(ge=0.001, le=0.1)] = 0.007
     """Lip radius, uncompressed, metres."""
-
-
-class Box(Strict):
-    """A box, centred on its own frame."""
-
-    shape: Literal["box"]
-    size_m: tuple[Annotated[float, Field(gt=0, le=2)], Annotated[float, Field(gt=0, le=2)],
-                  Annotated[float, Field(gt=0, le=2)]]
-    """Full edge lengths, metres."""
-    T_tcp_body: Placement = Placement()
-    """Where the body sits relative to the TCP."""
-
-
-class Cylinder(Strict):
-    """A cylinder along its own z, centred."""
-
-    shape: Literal["cylinder"]
-    radius_m: Annotated[float, Field(gt=0, le=1)]
-    """Radius, metres."""
-    length_m: Annotated[float, Field(gt=0, le=2)]
-    """Full length, metres."""
-    T_tcp_body: Placement = Placement()
-    """Where the body sits relative to the TCP."""
-
-
-Body = Box | Cylinder
-Bodies = Annotated[tuple[Annotated[Body, Field(discriminator="shape")], ...], Field(min_length=1)]
 
 
 class Fingers(Strict):

@@ -2,14 +2,16 @@
 
 import functools
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from binpick import geometry
 from binpick.geometry import Transform
-from binpick.settings import Fingers, SuctionTool, Tool
+from binpick.settings import Fingers, Mesh, SuctionTool, Tool
 from binpick.sim import exam
+from binpick.sim.hull import Hull
 from binpick.sim.world import WorldScene
 
 Points = Float[np.ndarray, "n 3"]
@@ -61,6 +63,9 @@ class Prism:
                           for p, q in edges])
 
 
+Solid: TypeAlias = Prism | Hull
+
+
 @dataclass(frozen=True, slots=True)
 class Grip:
     """Two fingers' work: the opening they come with, where along the closing axis the pads then stand, and what they hold."""
@@ -94,11 +99,11 @@ class Surroundings:
         leaving = _bodies(tool) + _fingers(tool.fingers, grip.low_m, grip.high_m)
         return max(coming, Surroundings(left).deepest(leaving, way_out))
 
-    def deepest(self, bodies: list[tuple[Prism, Transform]], motion: list[Transform]) -> float:
+    def deepest(self, bodies: list[tuple[Solid, Transform]], motion: list[Transform]) -> float:
         """The largest depth of these bodies, given in the TCP's frame, at these places of the TCP; 0 when clear."""
         return max([0.0, *(self._of_body(*body, motion) for body in bodies)])
 
-    def _of_body(self, prism: Prism, T_tcp_body: Transform, motion: list[Transform]) -> float:
+    def _of_body(self, prism: Solid, T_tcp_body: Transform, motion: list[Transform]) -> float:
         poses = [T_bin_tcp @ T_tcp_body for T_bin_tcp in motion]
         # both ways: corners of the body may lie between points of a part, and corners of a part between those of the body
         skin = _skin_of(prism)
@@ -129,16 +134,19 @@ def _way_out(T_bin_tcp: Transform, tool: Tool) -> list[Transform]:
     return [geometry.translation(0.0, 0.0, s) @ T_bin_tcp for s in _spaced(0.0, tool.lift_m, STEP_M)[1:]]
 
 
-def _fingers(fingers: Fingers, low_m: float, high_m: float) -> list[tuple[Prism, Transform]]:
+def _fingers(fingers: Fingers, low_m: float, high_m: float) -> list[tuple[Solid, Transform]]:
     """Both fingers with their pads' faces at these places along the TCP's x."""
     prism = Prism("box", (fingers.thickness_m, fingers.pad_width_m, fingers.length_m))
     return [(prism, geometry.translation(x, 0.0, -fingers.length_m / 2))
             for x in (low_m - fingers.thickness_m / 2, high_m + fingers.thickness_m / 2)]
 
 
-def _bodies(tool: Tool) -> list[tuple[Prism, Transform]]:
-    bodies = []
+def _bodies(tool: Tool) -> list[tuple[Solid, Transform]]:
+    bodies: list[tuple[Solid, Transform]] = []
     for body in tool.bodies:
+        if isinstance(body, Mesh):
+            bodies.append((Hull(body.hull_m), body.T_tcp_body.T_parent_this))
+            continue
         size = body.size_m if body.shape == "box" else (2 * body.radius_m, 2 * body.radius_m, body.length_m)
         bodies.append((Prism(body.shape, size), body.T_tcp_body.T_parent_this))
     return bodies
@@ -152,7 +160,7 @@ def _pieces(kind: str) -> tuple[tuple[Prism, Transform], ...]:
 
 
 @functools.lru_cache(maxsize=64)
-def _skin_of(prism: Prism) -> Points:
+def _skin_of(prism: Solid) -> Points:
     return prism.surface()
 
 
