@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
+from scipy import ndimage
 
 from binpick.data import Labels, Mask
 from binpick.scene.surface import Surface
@@ -93,25 +92,38 @@ def groups(extents: Extents, first: Pairs, second: Pairs, longest_m: float) -> I
 
     Segment 0, which no pair may hold, stays 0; the others' groups count in the order of their first members.
     """
-    count = len(extents.ends)
-    graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
-    whole: Groups = csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
-    long = extents.merged(whole).lengths_m > longest_m
-    if not long.any():
+    pairs = list(zip(first.tolist(), second.tolist(), strict=True))
+    owner = list(range(len(extents.ends)))
+    for pair in pairs:
+        _unite(owner, *pair)
+    whole = _numbered(owner)
+    if not np.isfinite(longest_m) or not (long := extents.merged(whole).lengths_m > longest_m).any():
         return whole
-    owner, ends = list(range(count)), extents.ends.copy()
-    for pair in zip(first.tolist(), second.tolist(), strict=True):
+    owner, ends = list(range(len(owner))), extents.ends.copy()
+    for pair in pairs:
         one, other = (_root(owner, segment) for segment in pair)
         both = np.maximum(ends[one], ends[other])
-        if one != other and (not long[whole[one]] or float((both[:DIRECTIONS] + both[DIRECTIONS:]).max()) <= longest_m):
-            owner[max(one, other)], ends[min(one, other)] = min(one, other), both
-    return np.unique([_root(owner, segment) for segment in range(count)], return_inverse=True)[1].astype(np.int64)
+        if not long[whole[one]] or float((both[:DIRECTIONS] + both[DIRECTIONS:]).max()) <= longest_m:
+            ends[_unite(owner, one, other)] = both
+    return _numbered(owner)
 
 
 def _root(owner: list[int], segment: int) -> int:
     while owner[segment] != segment:
-        segment = owner[segment]
+        owner[segment] = segment = owner[owner[segment]]
     return segment
+
+
+def _unite(owner: list[int], one: int, other: int) -> int:
+    """Makes two groups one; the lower root stays the root."""
+    first, last = sorted((_root(owner, one), _root(owner, other)))
+    owner[last] = first
+    return first
+
+
+def _numbered(owner: list[int]) -> Int64[np.ndarray, "c"]:
+    roots = [_root(owner, segment) for segment in range(len(owner))]
+    return np.unique(np.array(roots, dtype=np.int64), return_inverse=True)[1].astype(np.int64)
 
 
 def cut(labels: Labels, extents: Extents, longest_m: float, spacing_m: float) -> Labels:

@@ -59,9 +59,9 @@ def segment(surface: Surface, of_interest: Mask, settings: SegmentSettings) -> t
 
 
 def spacing(surface: Surface, of_interest: Mask) -> float:
-    """Median distance of neighbouring points of every fourth row, metres; 0 when there are none."""
-    both = of_interest[::4, 1:] & of_interest[::4, :-1]
-    step = surface.xyz[::4, 1:][both] - surface.xyz[::4, :-1][both]
+    """Median distance of neighbouring points of every eighth row, metres; 0 when there are none."""
+    both = of_interest[::8, 1:] & of_interest[::8, :-1]
+    step = surface.xyz[::8, 1:][both] - surface.xyz[::8, :-1][both]
     return float(np.sqrt(np.median(np.einsum("ij,ij->i", step, step)))) if len(step) else 0.0
 
 
@@ -120,12 +120,15 @@ def _parts(regions: Labels, along: list[Ways], surface: Surface, spacing_m: floa
     """Regions joined to parts; their extents; and how long parts are, which none exceeds that could be cut."""
     touching, extents, area = contacts(regions, along), Extents.of(regions, surface), _areas(regions, spacing_m)
     group = _joined(touching, area, extents, np.inf, spacing_m)
-    longest_m = longest_part(extents.merged(group).lengths_m, np.bincount(group, area).astype(np.float64))
-    if (extents.lengths_m > longest_m).any():
-        regions = cut(regions, extents, longest_m, spacing_m)
-        touching, extents, area = contacts(regions, along), Extents.of(regions, surface), _areas(regions, spacing_m)
-    group = _joined(touching, area, extents, longest_m, spacing_m)
-    return group.astype(np.int32)[regions], extents.merged(group), longest_m
+    whole = extents.merged(group)
+    longest_m = longest_part(whole.lengths_m, np.bincount(group, area).astype(np.float64))
+    if (whole.lengths_m > longest_m).any():
+        if (extents.lengths_m > longest_m).any():
+            regions = cut(regions, extents, longest_m, spacing_m)
+            touching, extents, area = contacts(regions, along), Extents.of(regions, surface), _areas(regions, spacing_m)
+        group = _joined(touching, area, extents, longest_m, spacing_m)
+        whole = extents.merged(group)
+    return group.astype(np.int32)[regions], whole, longest_m
 
 
 def _areas(labels: Labels, spacing_m: float) -> Float64[np.ndarray, "p"]:
