@@ -1,7 +1,5 @@
 """Both segmenters and both tools, from images to published poses: good ones, and the same bytes in every run."""
 
-from dataclasses import replace
-
 import cv2
 import pytest
 
@@ -18,11 +16,7 @@ def bins():
     paper = exam.paper("A", 2, parts=10)
 
     def by(method, tool):
-        asked = exam.for_tool(paper, tool)
-        job = asked.inputs.job
-        chosen = job.recipe.segment.model_copy(update={"method": method})
-        job = job.model_copy(update={"recipe": job.recipe.model_copy(update={"segment": chosen})})
-        asked = replace(asked, inputs=replace(asked.inputs, job=job))
+        asked = exam.for_method(exam.for_tool(paper, tool), method)
         return asked, pipeline.run(asked.inputs).result
 
     return {case: by(*case) for case in CASES}
