@@ -4,6 +4,7 @@ import io
 import json
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from binpick import cli, geometry
 from binpick.lab import exam, picks, tally
 from binpick.lab.exam import Paper
 from binpick.lab.parts import PartScore
-from binpick.lab.picks import Grip, Pick, Sheet
+from binpick.lab.picks import Grip, Pick, Sheet, Tried
 from binpick.sim.world import ScenePart, WorldScene
 
 TIMES = {"rectify": 10.0, "match": 100.0, "bin": 5.0, "segment": 20.0, "grasp": 30.0, "clearance": 40.0, "compute": 205.0}
@@ -95,6 +96,17 @@ def test_kinds_are_pooled_per_tool_and_mixed_parts_counted_once():
     assert (run["segments"]["all"]["good"], run["segments"]["all"]["of"]) == (5, 10)
 
 
+def test_segmenters_stand_beside_each_other():
+    by_other = Tried("open3d", (part(0.4), part(0.9)), (pick(grip(ok=False), timing_ms=TIMES | {"segment": 60.0}),))
+    run = tally.figures("A", 25, [replace(sheet, others=(by_other,)) for sheet in sheets()])
+    grid, other = run["methods"]["grid"], run["methods"]["open3d"]
+    assert grid["segments"] == run["segments"]["all"]
+    assert grid["p_at_1"] == {tool: rows["all"]["p_at_1"] for tool, rows in run["tools"].items()}
+    assert (other["segments"]["good"], other["segments"]["of"]) == (5, 10)
+    assert (other["p_at_1"]["suction"]["good"], other["p_at_1"]["suction"]["of"]) == (0, 5)
+    assert (grid["segment_ms"], other["segment_ms"]) == (20.0, 60.0)
+
+
 def test_the_table_says_the_same_and_knows_what_is_missing():
     empty = [Sheet(mix, 1, (), (pick(tool=tool, code=105, timing_ms={"compute": 115.0}),))
              for tool, mixes in picks.KINDS.items() for mix in mixes]
@@ -126,6 +138,9 @@ def test_one_rendering_serves_both_tools(two_parts):
         assert set(tally.STAGES) < set(each.timing_ms)
     assert all(math.isfinite(grip.off_m) for grip in sheet.picks[0].grips if grip.ok)
     assert sheet.picks[0].grips != sheet.picks[1].grips
+    (other,) = sheet.others
+    assert [each.code for each in other.picks] == [0, 0]
+    assert tally.recall(other.parts)["of"] == 2
 
 
 def test_another_tool_sees_the_same_frames(two_parts):

@@ -91,13 +91,6 @@ def test_a_covered_empty_bin_is_not_called_empty():
     assert pipeline.run(with_images(inputs, left, right)).result.return_code.code in (Code.BIN_UNKNOWN, Code.NO_DEPTH)
 
 
-def test_the_open3d_segmenter_gives_grasps_too(paper):
-    recipe = paper.inputs.job.recipe
-    segmented = recipe.model_copy(update={"segment": recipe.segment.model_copy(update={"method": "open3d"})})
-    result = pipeline.run(replace(paper.inputs, job=paper.inputs.job.model_copy(update={"recipe": segmented}))).result
-    assert result.return_code.code is Code.OK
-
-
 def test_images_of_another_size_are_refused(paper):
     small = np.ascontiguousarray(paper.inputs.pair.left.image[::2, ::2])
     with pytest.raises(ImageError, match="968x608"):

@@ -155,6 +155,16 @@ def test_a_steep_fold_is_within_a_part_where_both_sides_end_flush(plant, slab, l
     assert (one == other) is own
 
 
+@pytest.mark.parametrize(("others", "cut"), [(9, True), (3, False)], ids=["others tell", "too few to tell"])
+def test_what_is_longer_than_the_parts_of_its_bin_is_cut_at_its_neck(plant, slab, others, cut):
+    around = [slab(0.055 * (i % 5) - 0.11, 0.04 * (i // 5) + 0.01, 0.044, 0.025, 0.02) for i in range(others)]
+    pair = [slab(-0.02, -0.05, 0.044, 0.02, 0.02), slab(0.023, -0.062, 0.044, 0.02, 0.02)]
+    segments = segmented(plant(around + pair, noise_px=0.07))
+    left, right = labels_at(segments, (-0.02, -0.05), (0.023, -0.062))
+    assert (left != right) is cut
+    assert len(segments.part_confidence) == others + 1 + cut
+
+
 def test_a_leak_does_not_join_two_parts(plant, slab):
     # two plates of one height, 3 mm apart, bridged by a strip as wide as two pixels
     plates = [slab(-0.0415, 0, 0.08, 0.06, 0.03), slab(0.0415, 0, 0.08, 0.06, 0.03), slab(0, 0, 0.006, 0.0025, 0.03)]

@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 from binpick import settings
 from binpick.data import Frame, Light, StereoPair, Window
 from binpick.result import CycleInput, Request
-from binpick.settings import Recipe
+from binpick.settings import Recipe, SegmentSettings
 from binpick.settings.recipe import Shot
 from binpick.sim import exam
 from binpick.sim.render import Renderer
@@ -62,6 +62,14 @@ def for_tool(asked: Paper, kind: str) -> Paper:
     """The same frames for a cell whose one tool is the default of that kind."""
     tools = exam.cell(asked.scene.world, tools=[{"kind": kind}]).tools
     return replace(asked, inputs=replace(asked.inputs, job=asked.inputs.job.model_copy(update={"tools": tools})))
+
+
+def for_method(asked: Paper, method: str) -> Paper:
+    """The same frames for a recipe that tells parts apart by another method."""
+    job = asked.inputs.job
+    segment = SegmentSettings.model_validate(job.recipe.segment.model_dump() | {"method": method})
+    recipe = job.recipe.model_copy(update={"segment": segment})
+    return replace(asked, inputs=replace(asked.inputs, job=job.model_copy(update={"recipe": recipe})))
 
 
 def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:

@@ -16,6 +16,8 @@ KINDS = {"suction": ("block", "mixed", "bracket"), "two_finger": ("cylinder", "t
 """What each tool is tried on: parts that it is made for, and all together."""
 MIXES = tuple(dict.fromkeys(itertools.chain(*KINDS.values())))
 """Every bin that is filled; the frames of one serve all tools."""
+METHOD, OTHERS = "grid", ("open3d",)
+"""The recipe's way to tell parts apart, and those that are tried beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,15 @@ class Pick:
 
 
 @dataclass(frozen=True, slots=True)
+class Tried:
+    """The same bin by another segmenter."""
+
+    method: str
+    parts: tuple[PartScore, ...]
+    picks: tuple[Pick, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Sheet:
     """One bin: its parts against the segments, which do not depend on the tool, and a cycle of each of its tools."""
 
@@ -51,6 +62,7 @@ class Sheet:
     seed: int
     parts: tuple[PartScore, ...]
     picks: tuple[Pick, ...]
+    others: tuple[Tried, ...] = ()
 
 
 def sit(world: str, seeds: Iterable[int], count: int) -> Iterator[Sheet]:
@@ -60,12 +72,17 @@ def sit(world: str, seeds: Iterable[int], count: int) -> Iterator[Sheet]:
 
 
 def sheet(paper: Paper, kinds: str) -> Sheet:
-    """A bin of `KINDS`, rendered once, by each of its tools."""
+    """A bin of `KINDS`, rendered once, by each of its tools and by every segmenter."""
+    others = (Tried(method, *_cycles(exam.for_method(paper, method), kinds)) for method in OTHERS)
+    return Sheet(kinds, paper.scene.seed, *_cycles(paper, kinds), tuple(others))
+
+
+def _cycles(paper: Paper, kinds: str) -> tuple[tuple[PartScore, ...], tuple[Pick, ...]]:
     tools = [tool for tool, tried_on in KINDS.items() if kinds in tried_on]
     papers = [exam.for_tool(paper, tool) for tool in tools]
     outcomes = [pipeline.run(asked.inputs) for asked in papers]
     picks = (_pick(*each) for each in zip(tools, papers, outcomes, strict=True))
-    return Sheet(kinds, paper.scene.seed, _parts(paper, outcomes[0]), tuple(picks))
+    return _parts(paper, outcomes[0]), tuple(picks)
 
 
 def _pick(tool: str, paper: Paper, outcome: CycleResult) -> Pick:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from binpick.lab import exam, offsets, parts
 from binpick.lab.parts import PartScore
-from binpick.lab.picks import KINDS, MIXES, Pick, Sheet
+from binpick.lab.picks import KINDS, METHOD, MIXES, Pick, Sheet, Tried
 from binpick.sim import exam as frozen
 from binpick.sim import score
 
@@ -34,7 +34,21 @@ def figures(world: str, count: int, sheets: Sequence[Sheet]) -> Figures:
     return {
         "exam_sha256": frozen.sha256(), "world": world, "parts": count, "seeds": sorted({sheet.seed for sheet in sheets}),
         "tools": tools, "segments": {mix: recall(found) for mix, found in _pooled(seen).items()},
+        "methods": _methods(sheets),
     }
+
+
+def _methods(sheets: Sequence[Sheet]) -> Figures:
+    """Every segmenter's recall and first grasps, all kinds pooled, and its median time."""
+    tried = [each for sheet in sheets for each in (Tried(METHOD, sheet.parts, sheet.picks), *sheet.others)]
+    rows = {}
+    for method in dict.fromkeys(each.method for each in tried):
+        mine = [each for each in tried if each.method == method]
+        picks = [pick for each in mine for pick in each.picks]
+        p_at_1 = {tool: row(tool, [pick for pick in picks if pick.tool == tool])["p_at_1"] for tool in KINDS}
+        rows[method] = {"segments": recall([part for each in mine for part in each.parts]), "p_at_1": p_at_1,
+                        "segment_ms": _stages(picks)["segment"]}
+    return rows
 
 
 def _pooled(groups: dict[str, list[Item]]) -> dict[str, list[Item]]:
@@ -113,7 +127,17 @@ def tables(run: Figures) -> Group:
     whole = Table(f"parts seen {parts.PLAIN_VIEW:.0%} and more", f"one segment (IoU > {parts.HALF:.1f})", "share (95 %)")
     for mix, found in run["segments"].items():
         whole.add_row(mix, _of(found), _percent(found))
-    return Group(grips, OFF, offsets.table(run["tools"]), whole, stages)
+    return Group(grips, OFF, offsets.table(run["tools"]), whole, stages, _beside(run["methods"]))
+
+
+def _beside(methods: Figures) -> Table:
+    """The segmenters beside each other."""
+    table = Table("segmenter, all kinds", "one segment (95 %)", *(f"P@1 {tool}" for tool in KINDS), "segment, median ms")
+    for method, each in methods.items():
+        spent = each["segment_ms"]
+        table.add_row(method, _range(each["segments"]), *(_range(each["p_at_1"][tool]) for tool in KINDS),
+                      "-" if spent is None else f"{spent:.1f}")
+    return table
 
 
 def _within(each: Figures) -> str:

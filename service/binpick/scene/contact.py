@@ -47,21 +47,24 @@ class Ways:
 def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
     """The ways of all directions, `half_px` pixels to either side of their middle."""
     xyz, normal = (np.ascontiguousarray(field.transpose(2, 0, 1)) for field in (surface.xyz, surface.normal))
+    offset: Field = np.einsum("khw,khw->hw", xyz, normal)
     with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-ways") as pool:
-        return list(pool.map(partial(_ways, xyz, normal, surface.sigma_z_m, of_interest, half_px), DIRECTIONS))
+        return list(pool.map(partial(_ways, xyz, normal, offset, surface.sigma_z_m, of_interest, half_px), DIRECTIONS))
 
 
-def _ways(xyz: Planes, normal: Planes, sigma_z_m: Field, of_interest: Mask, half_px: int, direction: tuple[int, int]) -> Ways:
+def _ways(xyz: Planes, normal: Planes, offset: Field, sigma_z_m: Field, of_interest: Mask, half_px: int,
+          direction: tuple[int, int]) -> Ways:
     down, right = (sign * (half_px if not all(direction) else max(1, round(half_px / 2**0.5))) for sign in direction)
     start, middle, end = _grids(down, right, of_interest.shape)
-    above = np.zeros(of_interest[start].shape, dtype=np.float32)
-    below = above.copy()
+    # how far the end lies above the start's tangent plane, and the start above the end's; both halved
+    above, below = np.negative(offset[start]), np.negative(offset[end])
+    product = np.empty_like(above)
     for plane, slope in zip(xyz, normal, strict=True):
-        step = plane[end] - plane[start]
-        above += slope[start] * step
-        below -= slope[end] * step
-    half = np.float32(0.5)
-    return Ways(start, middle, end, of_interest[start] & of_interest[end], (above - below) * half, (above + below) * half,
+        above += np.multiply(slope[start], plane[end], out=product)
+        below += np.multiply(slope[end], plane[start], out=product)
+    above *= np.float32(0.5)
+    below *= np.float32(0.5)
+    return Ways(start, middle, end, of_interest[start] & of_interest[end], above - below, np.add(above, below, out=product),
                 np.minimum(sigma_z_m[start], sigma_z_m[end]))
 
 

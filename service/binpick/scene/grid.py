@@ -9,12 +9,11 @@ their border.
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from binpick.data import Labels, Mask
 from binpick.scene import prism
 from binpick.scene.contact import Contacts, Ways, contacts, ways
+from binpick.scene.extent import Extents, cut, groups, longest_part
 from binpick.scene.surface import Surface
 from binpick.settings import SegmentSettings
 
@@ -53,16 +52,16 @@ def segment(surface: Surface, of_interest: Mask, settings: SegmentSettings) -> t
     speck = max(2, int((SPECK_M / spacing_m) ** 2))
     borders = _without_specks(concave & of_interest, speck) | _without_specks(~of_interest, speck)
     regions = _grown(_cores(of_interest, borders, CORE_M / spacing_m), surface, of_interest, GROWTH_M / spacing_m)
-    parts = _joined(regions, along, spacing_m)
+    parts, extents, longest_m = _parts(regions, along, surface, spacing_m)
     faces = _faces(parts, concave | convex)
-    group = _groups(int(parts.max(initial=0)) + 1, *prism.pairs(faces, parts, surface, spacing_m))
-    return faces, group.astype(np.int32)[parts]
+    whole = groups(extents, *prism.pairs(faces, parts, surface, spacing_m), longest_m)
+    return faces, whole.astype(np.int32)[parts]
 
 
 def spacing(surface: Surface, of_interest: Mask) -> float:
-    """Median distance of neighbouring points of every fourth row, metres; 0 when there are none."""
-    both = of_interest[::4, 1:] & of_interest[::4, :-1]
-    step = surface.xyz[::4, 1:][both] - surface.xyz[::4, :-1][both]
+    """Median distance of neighbouring points of every eighth row, metres; 0 when there are none."""
+    both = of_interest[::8, 1:] & of_interest[::8, :-1]
+    step = surface.xyz[::8, 1:][both] - surface.xyz[::8, :-1][both]
     return float(np.sqrt(np.median(np.einsum("ij,ij->i", step, step)))) if len(step) else 0.0
 
 
@@ -117,21 +116,41 @@ def _grown(cores: Labels, surface: Surface, of_interest: Mask, reach_px: float) 
     return np.where(rest > 0, rest + regions.max(), regions).astype(np.int32)
 
 
-def _joined(regions: Labels, along: list[Ways], spacing_m: float) -> Labels:
-    """Regions joined to parts; 0 stays nobody."""
-    touching = contacts(regions, along)
-    area: Float64[np.ndarray, "p"] = np.bincount(regions.ravel()) * spacing_m**2
+def _parts(regions: Labels, along: list[Ways], surface: Surface, spacing_m: float) -> tuple[Labels, Extents, float]:
+    """Regions joined to parts; their extents; and how long parts are, which none exceeds that could be cut."""
+    touching, extents, area = contacts(regions, along), Extents.of(regions, surface), _areas(regions, spacing_m)
+    group = _joined(touching, area, extents, np.inf, spacing_m)
+    whole = extents.merged(group)
+    longest_m = longest_part(whole.lengths_m, np.bincount(group, area).astype(np.float64))
+    if (whole.lengths_m > longest_m).any():
+        if (extents.lengths_m > longest_m).any():
+            regions = cut(regions, extents, longest_m, spacing_m)
+            touching, extents, area = contacts(regions, along), Extents.of(regions, surface), _areas(regions, spacing_m)
+        group = _joined(touching, area, extents, longest_m, spacing_m)
+        whole = extents.merged(group)
+    return group.astype(np.int32)[regions], whole, longest_m
+
+
+def _areas(labels: Labels, spacing_m: float) -> Float64[np.ndarray, "p"]:
+    """The area that every label covers, seen from the camera."""
+    return np.asarray(np.bincount(labels.ravel()) * spacing_m**2)
+
+
+def _joined(touching: Contacts, area: Float64[np.ndarray, "p"], extents: Extents, longest_m: float,
+            spacing_m: float) -> Int64[np.ndarray, "p"]:
+    """The part of each region, none longer than that by joining; 0 stays nobody."""
     big = np.minimum(area[touching.first], area[touching.second]) > BIG_M2
     same = np.abs(touching.step_m) < np.where(big, BIG_STEP_M, STEP_M)
     same &= touching.bend_m < np.where(big, BIG_BEND_M, BEND_M)
     # each pixel along a border is crossed by about four ways
     same &= touching.count * spacing_m / 4 >= np.where(big, BIG_BORDER_M, BORDER_M)
-    group = _groups(len(area), touching.first[same], touching.second[same])
-    touching, area = touching.merged(group), np.bincount(group, weights=area).astype(np.float64)
+    kept = np.flatnonzero(same)
+    kept = kept[np.argsort(-touching.count[kept], kind="stable")]
+    group = groups(extents, touching.first[kept], touching.second[kept], longest_m)
+    touching, area, extents = touching.merged(group), np.bincount(group, weights=area).astype(np.float64), extents.merged(group)
     likely = np.minimum(area[touching.first], area[touching.second]) < FRAGMENT_M2
     likely &= (np.abs(touching.step_m) < FRAGMENT_STEP_M) & (touching.bend_m < FRAGMENT_BEND_M)
-    fragments = _groups(len(area), *_best(area, touching, likely))
-    parts: Labels = fragments[group].astype(np.int32)[regions]
+    parts: Int64[np.ndarray, "p"] = groups(extents, *_best(area, touching, likely), longest_m)[group]
     return parts
 
 
@@ -144,14 +163,6 @@ def _best(area: Float64[np.ndarray, "p"], touching: Contacts, likely: Bool[np.nd
     order = np.lexsort((large, -count, small))
     _, best = np.unique(small[order], return_index=True)
     return small[order][best], large[order][best]
-
-
-def _groups(count: int, first: Int64[np.ndarray, "n"], second: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "c"]:
-    """The group of each of `count` regions when pairs of them are made one; 0, which no pair may hold, stays 0."""
-    graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
-    _, group = csgraph.connected_components(graph, directed=False)
-    # nobody is region 0, a component of its own and the first
-    return np.asarray(group, dtype=np.int64)
 
 
 def _faces(parts: Labels, creases: Mask) -> Labels:

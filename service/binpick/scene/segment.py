@@ -53,11 +53,11 @@ def box(model: Bin, above_rim_m: float) -> tuple[geometry.Vector, geometry.Vecto
 def _inside(surface: Surface, model: Bin) -> Mask:
     """Measured points with a normal, above the floor and not of a wall."""
     length, width, _ = model.inner_size_m
-    x, y, z = surface.xyz[..., 0], surface.xyz[..., 1], surface.xyz[..., 2]
+    side = length / 2 - WALL_M, width / 2 - WALL_M
+    inside = cv2.inRange(surface.xyz, (-side[0], -side[1], LEAST_M), (*side, np.inf)) > 0
     with np.errstate(invalid="ignore"):
-        above = z > np.maximum(np.float32(LEAST_M), 3 * surface.sigma_z_m)
-        inside = (np.abs(x) < length / 2 - WALL_M) & (np.abs(y) < width / 2 - WALL_M)
-    return np.asarray(above & inside & np.isfinite(surface.normal[..., 0]))
+        above = surface.xyz[..., 2] > 3 * surface.sigma_z_m
+    return np.asarray(inside & above & np.isfinite(surface.normal[..., 0]))
 
 
 def _drop_small(labels: Labels, least: int) -> Labels:

@@ -4,7 +4,9 @@ On a plane 1/z, and so disparity, is affine in the pixel coordinates; a plane fi
 even. Each pixel takes the fit of the window around it, of five, that fits best, so a window across an edge never wins.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,6 +18,8 @@ from binpick.geometry import Transform
 
 RADIUS = 3
 """Half side of a fit window, half-resolution px: 7x7 are about 8 mm at 1 m."""
+STRIPS = 6
+"""So many strips of rows are fitted one by one."""
 SUPPORT = 0.5
 """Least share of measured pixels in a fit window."""
 WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RADIUS, RADIUS))
@@ -25,6 +29,7 @@ WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RA
 Box = tuple[geometry.Vector, geometry.Vector]
 """Lowest and highest corner."""
 Field = Float32[np.ndarray, "h w"]
+Rows = Float32[np.ndarray, "r w"]
 Values = Float32[np.ndarray, "n"]
 
 
@@ -81,10 +86,11 @@ def _half(depth: Depth) -> tuple[Field, Field]:
     """Mean disparity and sigma of each 2x2 block with at least two measured pixels, else NaN."""
     rows, cols = depth.disparity.shape[0] // 2, depth.disparity.shape[1] // 2
     known = depth.measured[:2 * rows, :2 * cols]
-    weight = cv2.resize(known.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
+    mask = np.ascontiguousarray(known).view(np.uint8)
+    weight = cv2.resize(mask.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
     # 0.49: two of four; NaN marks the rest, and passes through every division
     weight[weight < 0.49] = np.nan
-    values = (np.where(known, field[:2 * rows, :2 * cols], np.float32(0)) for field in (depth.disparity, depth.sigma_px))
+    values = (cv2.copyTo(field[:2 * rows, :2 * cols], mask) for field in (depth.disparity, depth.sigma_px))
     disparity, sigma_px = (cv2.resize(value, (cols, rows), interpolation=cv2.INTER_AREA) / weight for value in values)
     return disparity, sigma_px
 
@@ -129,15 +135,27 @@ def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
     """Least-squares planes of the windows centred on every pixel, by box sums; misfit is inf without support.
 
     float32 suffices around the median disparity: with |d| < 40 px the misfit, a difference of squares, is good to 1e-4 px².
+    Strips stay in the processor's cache; they are the same however many threads work on them.
     """
-    mid = float(np.nanmedian(disparity)) if known.any() else 0.0
-    d = np.where(known, disparity - np.float32(mid), np.float32(0))
-    w = known.astype(np.float32)
+    few = disparity[::4, ::4][known[::4, ::4]]
+    mid = np.float32(np.median(few) if few.size else 0)
+    d, w = cv2.copyTo(disparity - mid, known.view(np.uint8)), known.astype(np.float32)
+    edges = np.linspace(0, len(d), STRIPS + 1).astype(int).tolist()
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-fits") as pool:
+        strips = list(pool.map(partial(_strip, d, w), edges[:-1], edges[1:]))
+    a, b, level, misfit = (np.concatenate(fields) for fields in zip(*strips, strict=True))
+    return a, b, level + mid, misfit
+
+
+def _strip(d: Field, w: Field, begin: int, end: int) -> tuple[Rows, Rows, Rows, Rows]:
+    """The planes of some rows' windows; `d` is 0 where its weight `w` is."""
+    first = max(0, begin - RADIUS)
+    d, w, rows = d[first:end + RADIUS], w[first:end + RADIUS], slice(begin - first, end - first)
     ones = np.ones(2 * RADIUS + 1, dtype=np.float32)
     ramp = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
 
-    def window(field: Field, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Field:
-        summed: Field = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
+    def window(field: Field, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Rows:
+        summed: Rows = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)[rows]
         return summed
 
     n = np.maximum(window(w, ones, ones), 1)
@@ -154,4 +172,4 @@ def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
     a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
     misfit = np.maximum(dd - a * ud - b * vd, np.float32(0))
     misfit[~usable] = np.inf
-    return a, b, mean_d - a * mean_u - b * mean_v + np.float32(mid), misfit
+    return a, b, mean_d - a * mean_u - b * mean_v, misfit
