@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import open3d as o3d
 import pytest
@@ -170,6 +171,14 @@ def test_an_open_mesh_is_refused(tmp_path):
         shape.load(Mesh(file=path, unit="mm"))
 
 
+def test_a_sheet_with_two_sides_is_refused(tmp_path):
+    corners = np.array([[0.0, 0, 0], [50, 0, 0], [50, 40, 0], [0, 40, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
+    path = stl(tmp_path / "sheet.stl", corners, faces)
+    with pytest.raises(InputError, match="the mesh has no volume"):
+        shape.load(Mesh(file=path, unit="mm"))
+
+
 def test_what_is_no_mesh_is_refused(tmp_path):
     (tmp_path / "text.stl").write_text("nothing")
     with pytest.raises(InputError, match="holds no triangles"):
@@ -226,6 +235,15 @@ def test_a_recording_with_a_mesh_gives_the_same_bytes(posed, tmp_path):
     assert pipeline.run(inputs).result.timeless_bytes() == stored.timeless_bytes()
 
 
+def test_one_thread_gives_the_same_poses(posed):
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        assert pipeline.run(posed[0]).result.timeless_bytes() == posed[1].result.timeless_bytes()
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def test_frames_tell_the_same_part(posed):
     inputs, outcome = posed
     request = inputs.request.model_copy(update={"frame": "camera"})
@@ -246,6 +264,20 @@ def test_taught_grasps_are_taken_to_every_part(bin_of_brackets, bracket_file):
     wanted = [matrix(part.T_frame_part) @ down.T_part_tcp.T_parent_this for part in result.parts if part.T_frame_part]
     near = [min(np.linalg.norm(np.array(grasp.position_m) - T[:3, 3]) for grasp in result.grasps) for T in wanted]
     assert min(near) < 1e-9, "beside grasps that were found on the same part"
+
+
+def test_two_fingers_are_taught_too(bin_of_brackets, bracket_file):
+    # the upright wall between the pads, from above
+    grip = TaughtGrasp.model_validate({"tool": 1, "open_m": 0.02, "close_m": 0.004, "T_part_tcp": {
+        "position_m": [-0.023, 0.0, 0.006], "rotvec_rad": [3.14159265358979, 0, 0]}})
+    inputs = poses.by_mesh(bin_of_brackets[0], Mesh(file=bracket_file, unit="mm", grasps=(grip,)))
+    tools = exam.cell("B", tools=[{"kind": "two_finger"}]).tools
+    result = pipeline.run(replace(inputs, job=inputs.job.model_copy(update={"tools": tools}))).result
+    wanted = {part.id: matrix(part.T_frame_part) @ grip.T_part_tcp.T_parent_this for part in result.parts if part.T_frame_part}
+    taken = [grasp for grasp in result.grasps if grasp.part_id in wanted
+             and np.linalg.norm(np.array(grasp.position_m) - wanted[grasp.part_id][:3, 3]) < 1e-9]
+    assert taken
+    assert (taken[0].open_m, taken[0].close_m) == (0.02, 0.004)
 
 
 def matrix(pose):
