@@ -64,8 +64,17 @@ def run_file(path: Path) -> NoReturn:
     rig, warnings = rig_file.load(cell.rig)
     for warning in warnings:
         log.warning(warning)
+    _load_meshes(cell)
     run(cell, rig, cameras(cell))
     leave()
+
+
+def _load_meshes(cell: settings.Cell) -> None:
+    """Makes the parts' models, a second each, before a cycle needs them. Raises InputError for one that cannot be used."""
+    for mesh in (recipe.mesh for recipe in cell.recipes if recipe.mesh is not None):
+        from binpick.grasp import shape
+
+        shape.load(mesh)
 
 
 def leave() -> NoReturn:

@@ -82,7 +82,7 @@ def poses(inputs: CycleInput, cycle: CycleResult, proceed: Proceed = lambda: Non
     frames = replace(Frames.of(inputs), T_camera_bin=cycle.T_camera_bin)
     with clock.stage("pose"):
         ranked = (grasp.part_id for grasp in cycle.result.grasps)
-        parts = _located(inputs, cycle.T_camera_bin, cycle.rectified, segments, ranked)
+        parts = _located(inputs, cycle.T_camera_bin, cycle.rectified, segments, ranked, proceed)
     was, spent = cycle.result.timing_ms, clock.spent()
     times = {**was, **spent, "compute": round(was["compute"] + spent["compute"], 3)}
     messages = part_messages(parts, inputs, frames)
@@ -137,7 +137,7 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     if job.recipe.mesh is not None and job.recipe.mesh.grasps:
         with clock.stage("pose"):
             ranked = (grasp.part_id for grasp in rank.ordered(found, segments, *job.tools))
-            parts = _located(inputs, frames.T_camera_bin, rectified, segments, ranked)
+            parts = _located(inputs, frames.T_camera_bin, rectified, segments, ranked, clock.proceed)
             more, reasons = taught.candidates(parts, job.recipe.mesh, job.tools, segments, scene)
             found, counts = found + more, _summed(counts, reasons)
     if (inputs.request.frame or job.recipe.frame) == "base":
@@ -177,14 +177,22 @@ def _summed(counts: dict[str, int], more: dict[str, int]) -> dict[str, int]:
 
 
 def _located(inputs: CycleInput, T_camera_bin: Transform, rectified: Rectified, segments: Segments, ranked: Iterable[int],
-             ) -> tuple[PartPose, ...]:
+             proceed: Proceed) -> tuple[PartPose, ...]:
     """The poses of the recipe's number of parts: those with grasps in their order, then the surest and highest."""
     mesh = inputs.job.recipe.mesh
     assert mesh is not None
     height = {label: round(float(points[:, 2].mean()), 3) for label, points in segments.part_points.items()}
     rest = sorted(height, key=lambda label: (-segments.part_confidence[label] * height[label], label))
     seen = sight.Sight.of(segments, rectified, geometry.inverse(T_camera_bin))
-    return cad.locate(shape.load(mesh), seen, segments, dict.fromkeys([*ranked, *rest]), mesh.poses, _room(inputs.job))
+    model, order = shape.load(mesh), dict.fromkeys([*ranked, *rest])
+    return cad.locate(model, seen, segments, _each(order, proceed), mesh.poses, _room(inputs.job))
+
+
+def _each(order: Iterable[int], proceed: Proceed) -> Iterator[int]:
+    """The same, but that it is asked before each whether to go on: a part takes a tenth of a second."""
+    for label in order:
+        proceed()
+        yield label
 
 
 def _room(job: Job) -> tuple[Vector, Vector]:

@@ -5,15 +5,16 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import pytest
 
-from binpick import health, settings
+from binpick import health, pipeline, settings
 from binpick.camera.group import CameraGroup
 from binpick.cell import Cell
+from binpick.cell.worker import Pose as PoseStep
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import (
     Busy,
@@ -26,7 +27,7 @@ from binpick.errors import (
     NotReady,
     UnknownItem,
 )
-from binpick.result import CycleInput, CycleResult, Request, Result, ReturnCode, Snapshot
+from binpick.result import CycleInput, CycleResult, PartMessage, Request, Result, ReturnCode, Snapshot
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.sim.camera import SimCamera
@@ -101,8 +102,8 @@ def good(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
 
 @asynccontextmanager
 async def living(cameras: TestCameras, run: Callable[[CycleInput, Callable[[], None]], CycleResult] = good,
-                 ready: bool = True, **changes: object) -> AsyncIterator[Cell]:
-    cell = Cell(cell_settings(**changes), rig(), cameras, run, boot_id=7)
+                 ready: bool = True, pose: PoseStep = pipeline.poses, **changes: object) -> AsyncIterator[Cell]:
+    cell = Cell(cell_settings(**changes), rig(), cameras, run, boot_id=7, pose=pose)
     async with cell:
         if ready:
             await until(cell, lambda s: s.phase == "ready")
@@ -484,5 +485,82 @@ def test_stopping_ends_waiters_at_once_and_abandons_a_stuck_worker() -> None:
         assert not await cell.close(0.05)
         cameras.gate.set()
         assert await cell.close(2)
+
+    asyncio.run(scenario())
+
+
+PART = PartMessage(id=3, part_ids=(3,), label="bracket", frame="bin", score=0.9, T_frame_part=None)
+
+
+def test_poses_follow_the_grasps_in_the_same_place() -> None:
+    allowed = threading.Event()
+
+    def pose(_inputs: CycleInput, cycle: CycleResult, _proceed: Callable[[], None]) -> CycleResult:
+        allowed.wait(5)
+        return replace(cycle, result=cycle.result.model_copy(update={"parts": (PART,)}))
+
+    async def scenario() -> None:
+        async with living(released(), pose=pose) as cell:
+            cycle_id = cell.start(Request(), "rest")
+            before = await until(cell, lambda s: s.published is not None)
+            assert before.published is not None
+            assert not before.published.result.parts
+            allowed.set()
+            after = await until(cell, lambda s: s.published is not before.published)
+            assert after.published is not None
+            assert after.published is after.latest is cell.finished(cycle_id)
+            assert after.valid
+            assert after.published.result.parts == (PART,)
+            assert after.published.triggered_ns == before.published.triggered_ns
+            same = {"timing_ms": {}, "parts": ()}
+            assert after.published.result.model_copy(update=same) == before.published.result.model_copy(update=same)
+            assert dict(after.counts)["finished"] == 1
+
+    asyncio.run(scenario())
+
+
+def test_the_next_trigger_does_not_wait_for_poses() -> None:
+    given_up = threading.Event()
+
+    def pose(inputs: CycleInput, cycle: CycleResult, proceed: Callable[[], None]) -> CycleResult:
+        if inputs.cycle_id > 1:
+            return cycle
+        try:
+            for _ in range(500):
+                time.sleep(0.01)
+                proceed()
+        except Exception:
+            given_up.set()
+            raise
+        return cycle
+
+    async def scenario() -> None:
+        async with living(released(), pose=pose) as cell:
+            cell.start(Request(), "rest")
+            await until(cell, lambda s: s.latest is not None and s.phase == "ready")
+            cell.start(Request(), "rest")
+            done = await until(cell, lambda s: s.latest is not None and s.latest.result.cycle_id == 2)
+            assert given_up.is_set()
+            assert not done.faults
+
+    asyncio.run(scenario())
+
+
+def test_a_mesh_that_went_away_costs_the_poses_only(caplog: pytest.LogCaptureFixture) -> None:
+    asked = threading.Event()
+
+    def pose(_inputs: CycleInput, _cycle: CycleResult, _proceed: Callable[[], None]) -> CycleResult:
+        asked.set()
+        raise InputError("part.stl: the mesh cannot be read: No such file or directory")
+
+    async def scenario() -> None:
+        async with living(released(), pose=pose) as cell:
+            cell.start(Request(), "rest")
+            await until(cell, lambda s: s.latest is not None)
+            while "part.stl" not in caplog.text:
+                await asyncio.sleep(0.01)
+            assert asked.is_set()
+            assert cell.snapshot().valid
+            assert not cell.snapshot().faults
 
     asyncio.run(scenario())

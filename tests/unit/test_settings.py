@@ -123,3 +123,26 @@ def test_every_way_to_write_an_orientation(text):
     cell = settings.parse(BIN.replace("[0, 0, 1]", f"[0, 0, 1], {text}"), "cell.yaml")
     expected = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
     assert np.allclose(cell.bins[0].T_parent_bin, expected, atol=1e-6)
+
+
+MESH = """
+bin: {inner_size_m: [0.3, 0.2, 0.1], pose: {position_m: [0, 0, 1]}}
+tools: [{number: 1}, {number: 2}]
+recipes: [{mesh: {file: parts/a.stl, unit: mm, grasps: [GRASP]}}]
+"""
+
+
+def test_a_mesh_lies_beside_the_cell_file(tmp_path):
+    (tmp_path / "cell.yaml").write_text(MESH.replace("GRASP", "{tool: 1, T_part_tcp: {}}"))
+    mesh = settings.load(tmp_path / "cell.yaml").recipes[0].mesh
+    assert mesh is not None
+    assert mesh.file == tmp_path / "parts/a.stl"
+
+
+@pytest.mark.parametrize(("grasp", "says"), [
+    ("{tool: 2, T_part_tcp: {}}", r"recipe 1: mesh.grasps are for tool \[2\], the recipe's are \[1\]"),
+    ("{tool: 1, T_part_tcp: {}, open_m: 0.01, close_m: 0.02}", "close_m must not be above open_m"),
+])
+def test_a_taught_grasp_is_one_that_the_recipe_can_do(grasp, says):
+    with pytest.raises(SettingsError, match=says):
+        settings.parse(MESH.replace("GRASP", grasp), "cell.yaml")

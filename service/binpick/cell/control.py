@@ -12,7 +12,7 @@ from binpick.camera.base import Clock
 from binpick.cell import machine, memory, store, worker
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
-from binpick.cell.worker import Cameras, Run, Worker
+from binpick.cell.worker import Cameras, Pose, Run, Worker
 from binpick.errors import CycleRefused, NotInControl
 from binpick.recording import Recorder
 from binpick.result import Artefact, Published, Request, Snapshot, Source
@@ -31,8 +31,8 @@ class Cell:
     enforces deadlines, so that a worker stuck in a driver delays no answer.
     """
 
-    def __init__(self, cell: settings.Cell, rig: Rig, cameras: Cameras, run: Run = pipeline.run, *, boot_id: int,
-                 recorder: Recorder | None = None, clock: Clock = time.monotonic_ns) -> None:
+    def __init__(self, cell: settings.Cell, rig: Rig, cameras: Cameras, run: Run = pipeline.grasps, *, boot_id: int,
+                 pose: Pose = pipeline.poses, recorder: Recorder | None = None, clock: Clock = time.monotonic_ns) -> None:
         self._settings, self._rig, self._clock = cell, rig, clock
         kept = store.Store(cell.memory.directory) if cell.memory.directory is not None else None
         memories, trouble = kept.load() if kept is not None else ({}, "")
@@ -42,7 +42,7 @@ class Cell:
             max_age_ns=cell.result_max_age_ms * 1_000_000, memories=MappingProxyType(memories),
             faults=(trouble,) if trouble else ()), boot_id, cell.control)
         self._gallery = Gallery()
-        self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, recorder, clock))
+        self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, pose, recorder, clock))
         self._keeper = store.thread(kept, self._board) if kept is not None else None
         self._supervisor: asyncio.Task[None] | None = None
 

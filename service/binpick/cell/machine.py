@@ -145,6 +145,15 @@ def finish(state: State, cycle_id: int, published: Published | None, fault: str 
     return _publish(state, published)
 
 
+def complete(state: State, fuller: Published) -> State:
+    """A finished result says more than it did; whether it holds does not change. Nothing happens for one no longer kept."""
+    was = find(state, fuller.result.cycle_id)
+    if was is None:
+        return state
+    finished = tuple(fuller if each is was else each for each in state.finished)
+    return replace(state, finished=finished, published=fuller if state.published is was else state.published)
+
+
 def abort(state: State, cycle_id: int, now_ns: int, why: str = "") -> State:
     """Retires the running cycle (−26). Raises NotApplicable when that cycle is not running."""
     if state.running is None or state.running.cycle_id != cycle_id:

@@ -52,17 +52,19 @@ class Cameras(Protocol):
 
 
 Run = Callable[[CycleInput, Callable[[], None]], CycleResult]
+Pose = Callable[[CycleInput, CycleResult, Callable[[], None]], CycleResult]
 
 
 @dataclass(frozen=True, slots=True)
 class Worker:
-    """What the thread needs; `run` is the pipeline."""
+    """What the thread needs; `run` is the pipeline up to the grasps, `pose` adds the parts' poses once those are out."""
 
     board: Board
     gallery: Gallery
     cameras: Cameras
     rig: Rig
     run: Run
+    pose: Pose
     recorder: Recorder | None
     clock: Clock
 
@@ -100,7 +102,7 @@ class Worker:
         return 0 if self.board.state.cameras_up else attempts
 
     def _cycle(self, ticket: Ticket) -> None:
-        fault, inputs = "", None
+        fault, inputs, cycle = "", None, None
         try:
             inputs = self._acquire(ticket)
             cycle = self._compute(ticket, inputs)
@@ -131,8 +133,28 @@ class Worker:
                  len(result.grasps), (finished_ns - ticket.started_ns) / 1e6)
         if result.stopped:
             log.error("cycle %d: %s", ticket.cycle_id, "; ".join(state.faults))
+        if inputs is not None:
+            result = self._posed(inputs, cycle, published)
         if self.recorder is not None and inputs is not None:
             self.recorder.offer(inputs, result)
+
+    def _posed(self, inputs: CycleInput, cycle: CycleResult, published: Published) -> Result:
+        """The result with its parts' poses, in the place of the published one; without them when the next cycle is wanted."""
+        try:
+            result = self.pose(inputs, cycle, self._yield).result
+        except CycleAborted:
+            return published.result
+        except BinpickError as error:
+            log.warning("cycle %d: no poses: %s", inputs.cycle_id, error)
+            return published.result
+        if result is not published.result:
+            self.board.step(machine.complete, replace(published, result=result, body=result.json_bytes()))
+        return result
+
+    def _yield(self) -> None:
+        """Called between parts: whoever triggers or stops the cell does not wait for poses."""
+        if _wanted(self.board.state):
+            raise CycleAborted("the next cycle is wanted")
 
     def _acquire(self, ticket: Ticket) -> CycleInput:
         """All shots of the recipe, one after the other; they are accepted together, after the last."""
@@ -159,8 +181,8 @@ class Worker:
                 self.gallery.keep(inputs, cycle)
         times = {"acquire": (acquired_ns - ticket.started_ns) / 1e6, **cycle.result.timing_ms,
                  "total": (self.clock() - ticket.started_ns) / 1e6}
-        timed = cycle.result.model_copy(update={"timing_ms": {name: round(ms, 3) for name, ms in times.items()}})
-        return replace(cycle, result=timed)
+        rounded = {name: round(ms, 3) for name, ms in times.items()}
+        return replace(cycle, result=cycle.result.model_copy(update={"timing_ms": rounded}))
 
     def _proceed(self, ticket: Ticket) -> None:
         """Called between stages: a retired cycle ends at the next step, one out of time says so."""

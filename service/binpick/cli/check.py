@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from binpick.cell import Cameras
     from binpick.rig import Rig
     from binpick.settings import Bin, Cell, Recipe, Tool
+    from binpick.settings.mesh import Mesh
 
 CAMERA_LIMIT_S = 10.0
 
@@ -123,11 +124,23 @@ def _recipe(cell: "Cell", rig: "Rig", number: int) -> str:
     job = settings.resolve(cell, number)
     located = " (located by its rim)" if job.bin.locate else ""
     seen = f"{job.recipe.name}: bin {job.bin.number}{located}, tools {_numbers(job.tools)}, poses in {job.recipe.frame}"
+    if job.recipe.mesh is not None:
+        seen += f", {_mesh(job.recipe.mesh)}"
     try:
         pipeline.admit(rig, job, Request())
     except FlangePoseMissing:
         return f"{seen}; every request must carry T_base_flange"
     return seen
+
+
+def _mesh(mesh: "Mesh") -> str:
+    """The part's size and how often it looks alike. Raises InputError."""
+    from binpick.grasp import shape
+
+    model = shape.load(mesh)
+    alike = len(model.symmetry.turns)
+    turns = f"round, {alike} ways" if model.symmetry.axis is not None else f"looks alike {alike} ways"
+    return f"mesh {mesh.file.name} ({1000 * model.size_m:.1f} mm long, {turns})"
 
 
 def _open(cell: "Cell", cameras: "Cameras") -> str:

@@ -140,4 +140,7 @@ def _tell(outcome: "CycleResult", out: Path) -> None:
         console.print(table)
     if result.funnel is not None:
         console.print("  ".join(f"{name} {count}" for name, count in result.funnel.counts.items()))
+    if result.parts:
+        posed = sum(part.T_frame_part is not None for part in result.parts)
+        console.print(f"{posed} of {len(result.parts)} parts looked at have a pose by the mesh {result.parts[0].label}")
     console.print(f"{result.timing_ms.get('compute', 0):.0f} ms; written to {out}")

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from binpick import geometry
 from binpick.data import PartPose, Segments
@@ -16,10 +16,10 @@ from binpick.grasp.sight import Evidence, Sight, Target
 
 FIRST, SECOND = 100, 20
 """How many hypotheses the first and the second look leave."""
-LEAST_SCORE, LEAST_LEAD = 0.58, 0.15
-"""What a pose needs: its score, and by which share of it it leads the next one."""
-LEAST_FIT, MOST_OUTSIDE = 0.86, 0.05
-"""Likewise: the share of the segment's points that the part explains, and of the part that would lie in the bin's floor."""
+LEAST_SCORE, LEAST_LEAD, LEAST_FIT = 0.62, 0.12, 0.88
+"""What a pose needs: its score, by which share of it it leads the next one, and the share of the points it explains."""
+MOST_AGAINST, MOST_UNMEASURED, MOST_OUTSIDE = 0.10, 0.20, 0.05
+"""What it may have: of what should be seen of the part, that speaks against it or is not measured; of all, in the floor."""
 LEAST_POINTS = 250
 """A smaller segment may be the end of many things."""
 RIVAL_M = 0.0015
@@ -128,18 +128,23 @@ def _found(shape: Shape, seen: Sight, segments: Segments, label: int, inside: tu
     pose = poses.take(np.array([best]))
     rivals = scores[_distance(pose, poses, shape) > RIVAL_M]
     lead = float(scores[best] - rivals.max(initial=0)) / max(float(scores[best]), 1e-9)
-    sure = (len(segments.part_points[label]) >= LEAST_POINTS and scores[best] >= LEAST_SCORE and lead >= LEAST_LEAD
-            and evidence.fits[best] >= LEAST_FIT and evidence.outside[best] <= MOST_OUTSIDE)
-    return _Found((label,), pose, round(float(scores[best]), 3), bool(sure))
+    sure = (len(segments.part_points[label]) >= LEAST_POINTS and lead >= LEAST_LEAD and bool(_sound(evidence, scores)[best]))
+    return _Found((label,), pose, round(float(scores[best]), 3), sure)
+
+
+def _sound(evidence: Evidence, scores: Float64[np.ndarray, "h"]) -> Bool[np.ndarray, "h"]:
+    """Which hypotheses hold by themselves, rivals aside."""
+    e = evidence
+    return np.asarray((scores >= LEAST_SCORE) & (e.fits >= LEAST_FIT) & (e.against <= MOST_AGAINST)
+                      & (e.unmeasured <= MOST_UNMEASURED) & (e.outside <= MOST_OUTSIDE))
 
 
 def score(evidence: Evidence) -> Float64[np.ndarray, "h"]:
     """How well each hypothesis explains the segment, and the segment it: 0 to 1."""
     e = evidence
     explained = e.there + e.other
-    unmeasured = np.maximum(1 - explained - e.through - e.before - e.hidden, 0)
-    against = 2 * (e.through + e.before) + 0.25 * unmeasured + 0.5 * e.hidden
-    return np.asarray(e.fits * explained / (explained + against + 1e-6) * (1 - e.outside) ** 2)
+    doubt = 2 * e.against + 0.25 * e.unmeasured + 0.5 * e.hidden
+    return np.asarray(e.fits * explained / (explained + doubt + 1e-6) * (1 - e.outside) ** 2)
 
 
 def _distance(one: Poses, others: Poses, shape: Shape) -> Float64[np.ndarray, "h"]:

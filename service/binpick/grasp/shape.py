@@ -41,11 +41,11 @@ class Shape:
     points: Points
     normals: Points
     field: Field
-    directions: Points
+    directions: Float32[np.ndarray, "v 3"]
     seen: Bool[np.ndarray, "v n"]
-    middles: Points
+    middles: Float32[np.ndarray, "v 3"]
     symmetry: Symmetry
-    starts: Turns
+    starts: Float64[np.ndarray, "s 3 3"]
     size_m: float
 
 

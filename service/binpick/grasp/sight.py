@@ -151,6 +151,16 @@ class Evidence:
     hidden: Float64[np.ndarray, "h"]
     outside: Float64[np.ndarray, "h"]
 
+    @property
+    def against(self) -> Float64[np.ndarray, "h"]:
+        """What should not be so."""
+        return np.asarray(self.through + self.before)
+
+    @property
+    def unmeasured(self) -> Float64[np.ndarray, "h"]:
+        """What nothing is known of."""
+        return np.asarray(np.maximum(1 - self.there - self.other - self.against - self.hidden, 0))
+
 
 def evidence(poses: Poses, shape: Shape, sight: Sight, target: Target, inside: tuple[Vector, Vector]) -> Evidence:
     """The evidence for hypotheses; `inside` are the lowest and highest corner of the bin's inside."""

@@ -12,6 +12,8 @@ from binpick.geometry import Vector
 SIDES_M = (0.004, 1.0)
 """Largest sides of parts that stereo can see and a tool can lift; a mesh beyond them has the wrong unit."""
 UNITS = {"m": 1.0, "mm": 0.001}
+LEAST_VOLUME = 1e-5
+"""Of a part's, in cubes of its largest side: less is a sheet with two sides."""
 SKEW = np.array([0.5391, 0.3517, 0.7652])
 """A direction along no edge of anything that people design."""
 
@@ -64,6 +66,8 @@ def _closed(file: Path, vertices: Vertices, triangles: Triangles) -> Triangles:
                          "opposite ways). Export the part as a solid, or close its holes")
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     volume = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())
+    if abs(volume) < 6 * LEAST_VOLUME * float(np.ptp(vertices, axis=0).max()) ** 3:
+        raise InputError(f"{file}: the mesh has no volume: it is a surface, not a solid")
     return triangles if volume > 0 else triangles[:, ::-1]
 
 

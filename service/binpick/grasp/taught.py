@@ -13,8 +13,8 @@ from binpick.grasp.shape import Shape
 from binpick.settings import Tool, TwoFingerTool
 from binpick.settings.mesh import Mesh, TaughtGrasp
 
-SIGMA_XY_M, SIGMA_Z_M, SIGMA_TILT_RAD = 0.0006, 0.0004, 0.012
-"""How far accepted poses are off (1 sigma, tuning scenes)."""
+SIGMA_XY_M, SIGMA_Z_M, SIGMA_TILT_RAD = 0.00045, 0.00025, 0.022
+"""How far poses are off: 68 % of 668 on the exam's tuning seeds, along one axis; the angle is that of flat parts."""
 
 
 def candidates(parts: Sequence[PartPose], mesh: Mesh, tools: Sequence[Tool], segments: Segments, scene: Obstacles,

@@ -61,13 +61,13 @@ class Symmetry:
         return np.asarray(Rotation.from_rotvec(angle * self.axis).as_matrix())
 
 
-def angles(one: Turns, other: Turns) -> Float64[np.ndarray, "n m"]:
+def angles(one: Turns, other: Float64[np.ndarray, "m 3 3"]) -> Float64[np.ndarray, "n m"]:
     """The angle between each rotation of one and each of the other, radians."""
     traces = one.reshape(-1, 9) @ other.reshape(-1, 9).T
     return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
 
 
-def thinned(turns: Turns, apart_rad: float, symmetry: Symmetry) -> Turns:
+def thinned(turns: Turns, apart_rad: float, symmetry: Symmetry) -> Float64[np.ndarray, "k 3 3"]:
     """Those of `turns`, in order, that no earlier one is within `apart_rad` of, symmetric ones counted as one."""
     kept: list[int] = []
     free = np.ones(len(turns), dtype=bool)
