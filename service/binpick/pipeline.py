@@ -80,7 +80,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     with clock.stage("bin"):
         grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin),
                        segmentation.box(job.bin, job.recipe.limits.above_rim_m))
-        heights = heightmap.height_map(grid.xyz, job.bin)
+        eyes_bin = cloud.eyes(rectified, geometry.inverse(frames.T_camera_bin))
+        heights = heightmap.height_map(grid.xyz, job.bin, eyes_bin)
         filled = load_carrier.filling(heights, job.bin, job.recipe.part)
     seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points)
     if measured < LEAST_MEASURED:
