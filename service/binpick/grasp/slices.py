@@ -30,6 +30,8 @@ NEAR_M = 0.08
 """Parts this near a wall are also looked at from further inside: there a gripper's body finds no room beside the wall."""
 LEANS = (0.5, 0.95)
 """So far, in shares of the tool's limit."""
+HIGHER = 0.25
+"""Ends of a round bar count this share of its radius above its widest line."""
 THIN = 2
 """Inside a patch every second point of every second row is enough; its border counts in full."""
 
@@ -123,10 +125,12 @@ def _rounded(seen: Slices, circle: Circles, x_m: Values, z_m: Values) -> Slices:
         chosen: Values = np.where(circle.round, bar, other)
         return chosen
 
-    level, deep, middle = np.zeros(len(seen.part)), z_m + circle.z_m, x_m + circle.x_m
+    level, widest, middle = np.zeros(len(seen.part)), z_m + circle.z_m, x_m + circle.x_m
+    # a little beyond its widest line a bar is held: one on the floor leaves fingertips no more
+    deep = widest - HIGHER * circle.radius_m
     return replace(seen, low_m=either(middle - circle.radius_m, seen.low_m),
                    high_m=either(middle + circle.radius_m, seen.high_m), deep_m=either(deep, seen.deep_m),
-                   touch_m=either(deep, seen.touch_m), lean=either(level, seen.lean),
+                   touch_m=either(widest, seen.touch_m), lean=either(level, seen.lean),
                    chord=np.where(circle.cap, np.pi / 2, either(level, seen.chord)))
 
 
