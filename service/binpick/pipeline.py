@@ -29,11 +29,7 @@ from binpick.grasp import (
     verification,
     wrist,
 )
-from binpick.result import (
-    CycleInput,
-    CycleResult,
-    Request,
-)
+from binpick.result import CycleInput, CycleResult, Request
 from binpick.rig import Rig
 from binpick.scene import bin as load_carrier
 from binpick.scene import heightmap
@@ -48,7 +44,6 @@ LEAST_MEASURED = 0.20
 """Below this share of measured pixels in the window there is no depth to speak of."""
 MOST_LOOKED_AT = 80
 """So many of the best grasps get an exact look at what their tool would hit."""
-
 POSE_M = 0.0025
 """Parts may seem to lie this deep in the bin's floor or walls."""
 
@@ -119,7 +114,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     with clock.stage("bin"):
         grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin),
                        segmentation.box(job.bin, job.recipe.limits.above_rim_m))
-        heights = heightmap.height_map(grid.xyz, job.bin)
+        eyes_bin = cloud.eyes(rectified, geometry.inverse(frames.T_camera_bin))
+        heights = heightmap.height_map(grid.xyz, job.bin, eyes_bin)
         filled = load_carrier.filling(heights, job.bin, job.recipe.part)
     seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points,
                        T_camera_bin=frames.T_camera_bin)
@@ -145,10 +141,9 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     found, limited = admission.admitted(found, job)
     with clock.stage("clearance"):
         kept, clear_counts = _clear(found, segments, heights, scene, inputs)
-    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **limited,
-              **clear_counts}
     messages, gate_counts = publishable(kept, inputs, frames)
-    counts |= gate_counts
+    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **limited,
+              **clear_counts, **gate_counts}
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
     result = result.model_copy(update={"parts": part_messages(parts, inputs, frames)})

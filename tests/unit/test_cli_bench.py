@@ -32,7 +32,7 @@ def test_the_whole_exam_keeps_its_options_and_names_its_parts(monkeypatch, capsy
 
 @pytest.mark.parametrize(("part", "options"), [
     ("stereo", ("--world", "--scenes", "--tuning", "--repeats", "--middlebury", "--out", "--json")),
-    ("grasp", ("--world", "--scenes", "--parts", "--tuning", "--json")),
+    ("grasp", ("--world", "--scenes", "--parts", "--clear", "--gate", "--full", "--folder", "--tuning", "--json")),
 ])
 def test_the_other_parts_have_their_own(monkeypatch, capsys, part, options):
     monkeypatch.setenv("COLUMNS", "200")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from binpick import geometry
-from binpick.grasp import clearance, fingers, rank
+from binpick.grasp import bars, clearance, fingers, rank, slices
 from binpick.scene import heightmap, segment
 from binpick.scene.surface import surface
 from binpick.settings import TwoFingerTool
@@ -137,3 +137,28 @@ def test_what_lies_under_another_part_is_not_lifted(plant, slab):
 
 def test_a_scene_without_parts_has_no_grasps(plant):
     assert found(plant([]))[0] == []
+
+
+def test_a_round_bar_is_as_wide_as_its_circle_and_one_whose_top_alone_is_seen_is_no_hold():
+    def seen_of(share, radius=0.012):
+        x = np.linspace(-share * radius, share * radius, 41)
+        z = radius - np.sqrt(radius**2 - x**2)
+        of = bars.moments(x, z).sum(axis=1)[:, None]
+        return bars.circles(of, x[:1], x[-1:])
+
+    most, cap, flat = seen_of(0.9), seen_of(0.5), seen_of(0.02)
+    assert most.round.all()
+    assert most.radius_m[0] == pytest.approx(0.012, abs=1e-5)
+    assert (most.x_m[0], most.z_m[0]) == pytest.approx((0.0, 0.012), abs=1e-5)
+    assert cap.cap.all()
+    assert not cap.round.any()
+    assert not flat.round.any()
+    assert not flat.cap.any()
+
+
+def test_beside_a_wall_the_gripper_also_comes_from_further_inside(plant, slab):
+    _, scene, segments = seen(plant([slab(0.0, 0.06, 0.04, 0.03, 0.03)]))
+    z = slices.cut(segments, 0.012, 0.6, scene.half_m).R_bin_tcp[:, :, 2]
+    assert z[:, 1].max() == pytest.approx(np.sin(0.57), abs=1e-6)
+    assert z[:, 1].min() > -0.1, "never towards the wall from outside"
+    assert np.arccos(-z[:, 2]).max() <= 0.6

@@ -152,13 +152,13 @@ def test_another_tool_sees_the_same_frames(two_parts):
 
 
 @pytest.mark.slow
-def test_the_command_prints_its_figures(monkeypatch, capsys):
+def test_the_command_prints_its_figures(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(sys, "argv", ["binpick", "bench", "grasp", "--tuning", "--world", "B", "--scenes", "1", "--parts", "3",
-                                      "--json"])
+                                      "--folder", str(tmp_path), "--json"])
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert not ended.value.code
-    run = json.loads(capsys.readouterr().out)
+    run, = json.loads(capsys.readouterr().out)["series"]
     assert (run["world"], run["parts"], run["seeds"]) == ("B", 3, [1])
     assert run["tools"]["suction"]["all"]["scenes"] == run["tools"]["two_finger"]["all"]["scenes"] == 3
     assert run["segments"]["all"]["of"] > 0

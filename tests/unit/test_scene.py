@@ -199,3 +199,36 @@ def test_an_empty_bin_has_no_segments(plant):
     segments = segmented(plant([]))
     assert not segments.part_confidence
     assert not segments.parts.any()
+
+
+def test_what_hides_behind_an_edge_lies_below_the_sight_lines_over_it(job):
+    ys, xs = np.mgrid[-0.0995:0.1:0.001, -0.1495:0.15:0.001]
+    z = np.where((np.abs(xs) < 0.02) & (np.abs(ys) < 0.02), 0.05, 0.0)
+    shadow = (np.abs(ys) < 0.02) & (xs > 0.02) & (xs < 0.032)
+    xyz = np.where(shadow[..., None], np.nan, np.stack([xs, ys, z], axis=-1)).astype(np.float32)
+    eyes = np.array([[-0.2, 0.0, 0.9], [0.1, 0.0, 0.9]])
+    shut, open_ = (heightmap.height_map(xyz, job.bin, at).watertight[50, 85:91] for at in (heightmap.NO_EYES, eyes))
+    assert shut[0] == pytest.approx(0.05)
+    assert (np.diff(shut) < 0).any()
+    assert open_[0] == pytest.approx(0.05), "edges are measured to a cell"
+    # the flattest sight line comes over 0.22 m from 0.8 m above the rim
+    assert np.diff(open_)[1] == pytest.approx(-0.002 * 0.8 / 0.23, abs=4e-4)
+
+
+def test_a_pixel_that_stands_out_is_no_obstacle_and_a_thin_wall_is_one(job):
+    ys, xs = np.mgrid[-0.0995:0.1:0.001, -0.1495:0.15:0.001]
+    z = np.where(np.abs(xs) < 0.002, 0.03, 0.0)
+    z[20, 20] = 0.05
+    heights = heightmap.height_map(np.stack([xs, ys, z], axis=-1).astype(np.float32), job.bin).height
+    assert heights[:20, :20].max() == 0
+    assert heights[50, 74:76].min() == pytest.approx(0.03)
+
+
+def test_a_wall_hides_nothing_from_eyes_inside_and_much_from_eyes_beyond(job):
+    ys, xs = np.mgrid[-0.0995:0.1:0.001, -0.1495:0.15:0.001]
+    z = np.where(xs > 0.147, 0.10, 0.0)
+    hole = (xs > 0.140) & (xs < 0.147) & (np.abs(ys) < 0.03)
+    xyz = np.where(hole[..., None], np.nan, np.stack([xs, ys, z], axis=-1)).astype(np.float32)
+    inside, beyond = (heightmap.height_map(xyz, job.bin, np.array([[x, 0.0, 0.9]])).watertight[50, 146] for x in (0.0, 0.3))
+    assert inside == 0
+    assert beyond > 0.085

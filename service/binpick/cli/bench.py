@@ -62,27 +62,33 @@ def grasp(
     world: Annotated[str, typer.Option(help="Exam world: A (6 mm lens, 600x400 mm bin) or B (12 mm lens, 300x200 mm).")] = "A",
     scenes: Annotated[int, typer.Option(help="How many seeds from 101, or with --tuning from 1.", min=1, max=10)] = 10,
     parts: Annotated[int, typer.Option(help="Parts per bin.", min=1, max=100)] = 25,
+    clear: Annotated[int, typer.Option(help="Of so many of these seeds, bins are also emptied.", min=0, max=10)] = 0,
+    gate: Annotated[bool, typer.Option("--gate", help="World A, 25 and 60 parts; 3 seeds emptied (1 h).")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Both worlds, 20 to 60 parts, projector on and off.")] = False,
     tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
+    folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Keeps finished sheets and pictures: a run goes on where "
+                                                "it ended. Else the user's cache.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """First cycles over kinds of parts, per tool: grasps, segments, sigma and stages against the simulator's ground truth."""
+    """First cycles over kinds of parts, per tool, and bins emptied: grasps, segments, sigma, stages against the truth."""
     import json
 
     from rich.console import Console
-    from rich.progress import track
+    from rich.progress import Progress
 
-    from binpick.lab import picks, tally
+    from binpick.lab import archive, harvest, programme, tally
     from binpick.sim import exam as frozen
 
-    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:scenes]
-    sitting = picks.sit(world, seeds, parts)
-    total = len(picks.MIXES) * len(seeds)
-    sheets = list(track(sitting, "Picking", total=total, console=Console(stderr=True), transient=True))
-    run = tally.figures(world, parts, sheets)
+    chosen = programme.GATE if gate else programme.FULL if full else (programme.Bins(world, parts, scenes, clear),)
+    seeds = frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("Picking", total=sum(bins.sheets for bins in chosen))
+        run = programme.run(chosen, seeds, archive.Archive(folder or archive.default()), lambda: progress.advance(task))
     if as_json:
         typer.echo(json.dumps(run, indent=1))
-    else:
-        Console(width=150).print(tally.tables(run))
+        return
+    for series in run["series"]:
+        Console(width=150).print(tally.tables(series), harvest.table(series["clearing"]))
 
 
 @bench.command()

@@ -46,6 +46,13 @@ class Obstacles:
     origin_x_m: float
     origin_y_m: float
 
+    @property
+    def half_m(self) -> tuple[float, float]:
+        """How far the walls are from the bin's middle, along x and y, to a cell."""
+        rows, cols = self.height.shape
+        x, y = (side * self.cell_m / 2 - round(PAD_M / self.cell_m) * self.cell_m for side in (cols, rows))
+        return x, y
+
     def within(self, points: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Which points lie inside the bin's walls, and not on them; NaN does not."""
         border = round(PAD_M / self.cell_m) * self.cell_m + WALL_M

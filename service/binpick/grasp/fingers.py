@@ -51,7 +51,7 @@ def candidates(segments: Segments, tool: TwoFingerTool, sigma_z_m: np.ndarray, s
 
     Qualities are 0 until ranked. The pose's z points into the part, x along the closing direction.
     """
-    cut = slices.cut(segments, tool.fingers.pad_width_m, tool.max_tilt_rad)
+    cut = slices.cut(segments, tool.fingers.pad_width_m, tool.max_tilt_rad, scene.half_m)
     reasons = {"slices": len(cut.part)}
     fits = cut.width_m + 2 * GAPS_M[-1] <= tool.fingers.stroke_max_m
     fits &= cut.width_m > tool.fingers.stroke_min_m

@@ -4,7 +4,7 @@ All slices of a scene are cut at once: every measured point falls into a strip o
 one sort orders them, and a slice is a window over neighbouring strips.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import cv2
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from binpick.data import Labels, Segments
+from binpick.grasp.bars import Circles, circles, moments
 
 STRIPS = 5
 """A slice is cut into this many strips, each with its own two ends."""
@@ -25,6 +26,12 @@ SAME_RAD = np.radians(6.0)
 """Axes and approaches this near each other are one."""
 TOUCH_M = 0.0005
 """Strips that end this near the outermost end are touched with it."""
+NEAR_M = 0.08
+"""Parts this near a wall are also looked at from further inside: there a gripper's body finds no room beside the wall."""
+LEANS = (0.5, 0.95)
+"""So far, in shares of the tool's limit."""
+HIGHER = 0.25
+"""Ends of a round bar count this share of its radius above its widest line."""
 THIN = 2
 """Inside a patch every second point of every second row is enough; its border counts in full."""
 
@@ -76,9 +83,12 @@ class Slices:
         return Slices(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
-def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
-    """All slices of all parts and faces, good or not, `width_m` wide; none is looked at more than `max_tilt_rad` aslant."""
-    views = _views(_patches(segments), max_tilt_rad)
+def cut(segments: Segments, width_m: float, max_tilt_rad: float, half_m: tuple[float, float]) -> Slices:
+    """All slices of all parts and faces, good or not, `width_m` wide; none is looked at more than `max_tilt_rad` aslant.
+
+    `half_m`: how far the walls are from the bin's middle, along x and y.
+    """
+    views = _views(_patches(segments), max_tilt_rad, half_m)
     turned = [(view, angle) for view in views for angle in _axes(view)]
     if not turned:
         whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -87,8 +97,9 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     strips = _strips(turned, pitch)
     known = np.isfinite(strips.low)
     which, window = np.nonzero(known.sum(axis=2) >= LEAST_STRIPS)
-    low, high, low_z, high_z, nx, nz = (values[which, window] for values in (
-        strips.low, strips.high, strips.low_z, strips.high_z, strips.normal_x, strips.normal_z))
+    low, high, low_z, high_z = (values[which, window] for values in (strips.low, strips.high, strips.low_z, strips.high_z))
+    n_x, n_z, *sums = np.nansum(strips.sums[:, which, window], axis=2)
+    x_m, z_m = strips.middle[which].T
     at = (np.arange(STRIPS) - (STRIPS - 1) / 2) * pitch
     (low_slope, low_off), (high_slope, high_off) = (_lines(at, ends) for ends in (low, high))
     ends_z = np.stack([_mean(low_z), _mean(high_z)])
@@ -96,13 +107,31 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float) -> Slices:
     touch = [np.where(outwards <= TOUCH_M, z, np.inf).min(axis=1)
              for outwards, z in ((low - left[:, None], low_z), (right[:, None] - high, high_z))]
     frames = np.stack([_frame(view, angle) for view, angle in turned])
-    return Slices(
+    seen = Slices(
         part=np.array([view.part for view, _ in turned])[which], axis=which, R_bin_tcp=frames[which], low_m=left, high_m=right,
         across_m=(strips.first[which] + STEP * window - (STRIPS - LEAST_STRIPS) + STRIPS / 2) * pitch,
         deep_m=ends_z.max(axis=0), touch_m=np.minimum(*touch),
         slope=np.arctan(np.stack([low_slope, high_slope], axis=1)), residual_m=np.maximum(low_off, high_off),
-        lean=np.arctan2(np.nansum(nx, axis=1), -np.nansum(nz, axis=1)),
-        chord=np.arctan2(ends_z[1] - ends_z[0], np.maximum(right - left, 1e-6)))
+        lean=np.arctan2(n_x, -n_z), chord=np.arctan2(ends_z[1] - ends_z[0], np.maximum(right - left, 1e-6)))
+    return _rounded(seen, circles(np.stack(sums), left - x_m, right - x_m), x_m, z_m)
+
+
+def _rounded(seen: Slices, circle: Circles, x_m: Values, z_m: Values) -> Slices:
+    """The slices, those across round bars with their true ends, which face each other from wherever they are looked at.
+
+    Circles are told from the place x_m, z_m. Of a cap the ends are on top, where fingers slip off: no hold, its chord says.
+    """
+    def either(bar: Values, other: Values) -> Values:
+        chosen: Values = np.where(circle.round, bar, other)
+        return chosen
+
+    level, widest, middle = np.zeros(len(seen.part)), z_m + circle.z_m, x_m + circle.x_m
+    # a little beyond its widest line a bar is held: one on the floor leaves fingertips no more
+    deep = widest - HIGHER * circle.radius_m
+    return replace(seen, low_m=either(middle - circle.radius_m, seen.low_m),
+                   high_m=either(middle + circle.radius_m, seen.high_m), deep_m=either(deep, seen.deep_m),
+                   touch_m=either(widest, seen.touch_m), lean=either(level, seen.lean),
+                   chord=np.where(circle.cap, np.pi / 2, either(level, seen.chord)))
 
 
 Patch: TypeAlias = tuple[int, Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]
@@ -139,8 +168,8 @@ def _telling(labels: Labels, pixels: Int64[np.ndarray, "n"]) -> Bool[np.ndarray,
     return found
 
 
-def _views(patches: list[Patch], max_tilt_rad: float) -> list[View]:
-    """Every patch along its mean normal, as far as the tool may tilt, and straight down."""
+def _views(patches: list[Patch], max_tilt_rad: float, half_m: tuple[float, float]) -> list[View]:
+    """Every patch along its mean normal, as far as the tool may tilt, straight down, and at a wall from further inside."""
     seen = []
     for patch in patches:
         mean = patch[2].mean(axis=0)
@@ -150,8 +179,22 @@ def _views(patches: list[Patch], max_tilt_rad: float) -> list[View]:
             seen.append((patch, -mean))
         if tilt > SAME_RAD:
             seen.append((patch, np.array([0.0, 0.0, -1.0])))
+        seen += [(patch, approach) for approach in _from_inside(patch[1].mean(axis=0), max_tilt_rad, half_m)]
     frames = _frames(np.array([approach for _, approach in seen]).reshape(-1, 3))
     return [View(part, R, points @ R, normals @ R) for ((part, points, normals), _), R in zip(seen, frames, strict=True)]
+
+
+def _from_inside(at_m: Float64[np.ndarray, "3"], max_tilt_rad: float, half_m: tuple[float, float],
+                 ) -> list[Float64[np.ndarray, "3"]]:
+    """Approaches that keep a gripper's body away from the walls that are near: towards each, leaning by shares of the limit."""
+    found = []
+    for axis in (0, 1):
+        if abs(at_m[axis]) > half_m[axis] - NEAR_M:
+            for lean in (share * max_tilt_rad for share in LEANS):
+                approach = np.array([0.0, 0.0, -np.cos(lean)])
+                approach[axis] = np.copysign(np.sin(lean), at_m[axis])
+                found.append(approach)
+    return found
 
 
 def _frames(z: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
@@ -184,9 +227,10 @@ def _frame(view: View, angle: float) -> Float64[np.ndarray, "3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """Windows over the strips of every view and axis, NaN where a strip has no point: both ends, their z, sums of normals.
+    """Windows over the strips of every view and axis, NaN where a strip has no point: both ends, their z, sums over points.
 
-    `first`: the number of each axis' first strip, counted from the bin's origin.
+    `first`: the number of each axis' first strip, counted from the bin's origin. `sums`: of n_x, n_z, and of
+    `bars.moments`, for which x and z count from each axis' `middle`.
     """
 
     first: Int64[np.ndarray, "axes"]
@@ -194,8 +238,8 @@ class Strips:
     high: Float64[np.ndarray, "axes windows strips"]
     low_z: Float64[np.ndarray, "axes windows strips"]
     high_z: Float64[np.ndarray, "axes windows strips"]
-    normal_x: Float64[np.ndarray, "axes windows strips"]
-    normal_z: Float64[np.ndarray, "axes windows strips"]
+    sums: Float64[np.ndarray, "eleven axes windows strips"]
+    middle: Float64[np.ndarray, "axes 2"]
 
 
 def _strips(turned: list[tuple[View, float]], pitch_m: float) -> Strips:
@@ -211,9 +255,10 @@ def _strips(turned: list[tuple[View, float]], pitch_m: float) -> Strips:
     strip -= first[axis]
     count = int(strip.max()) + 1
     cell = axis * count + strip
+    middle = np.stack([np.add.reduceat(side, begins) for side in (x, z)], axis=1) / np.diff(begins, append=len(x))[:, None]
     # one integer orders by cell, then by x to a micrometre
     order = np.argsort((cell << 23) + np.round((x + 4) * 1e6).astype(np.int64))
-    cell, x, z, n_x, n_z = cell[order], x[order], z[order], (cos * n_u + sin * n_v)[order], n_z[order]
+    cell, axis, x, z, n_x, n_z = cell[order], axis[order], x[order], z[order], (cos * n_u + sin * n_v)[order], n_z[order]
     low = np.flatnonzero(np.diff(cell, prepend=-1))
     high = np.append(low[1:], len(cell)) - 1
 
@@ -223,8 +268,10 @@ def _strips(turned: list[tuple[View, float]], pitch_m: float) -> Strips:
         grid[cell[low] // count, cell[low] % count + beside] = values
         return np.lib.stride_tricks.sliding_window_view(grid, STRIPS, axis=1)[:, ::STEP]
 
+    from_middle = (side - middle[axis, i] for i, side in enumerate((x, z)))
+    summed = np.concatenate([[n_x, n_z], moments(*from_middle)])
     return Strips(first=first, low=windows(x[low]), high=windows(x[high]), low_z=windows(z[low]), high_z=windows(z[high]),
-                  normal_x=windows(np.add.reduceat(n_x, low)), normal_z=windows(np.add.reduceat(n_z, low)))
+                  sums=np.stack([windows(np.add.reduceat(values, low)) for values in summed]), middle=middle)
 
 
 def _mean(values: Windows) -> Values:

@@ -1,12 +1,14 @@
 """The exam's frames: a settled world, the pair its cameras take, and the truth behind it, made once per scene."""
 
 import functools
+import hashlib
 from dataclasses import dataclass, replace
 
 from scipy.stats import binomtest
 
 from binpick import settings
-from binpick.data import Frame, Light, StereoPair, Window
+from binpick.data import Frame, Image, Light, StereoPair, Window
+from binpick.lab.archive import NOWHERE, Archive
 from binpick.result import CycleInput, Request
 from binpick.settings import Recipe, SegmentSettings
 from binpick.settings.recipe import Shot
@@ -43,7 +45,7 @@ def renderer(world: str) -> Renderer:
 
 
 def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recipe: int = 1, frame: str = "bin",
-          projector: bool | None = None, shots: tuple[Shot, ...] = ()) -> Paper:
+          projector: bool | None = None, shots: tuple[Shot, ...] = (), keep: Archive = NOWHERE) -> Paper:
     """A scene of the exam as the daemon would get it: recipe, pattern on, poses in the bin's frame.
 
     `kinds` as in `sim.exam.kinds`; `projector` and `shots` replace the recipe's own.
@@ -53,7 +55,7 @@ def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recip
     changes = ({} if projector is None else {"projector": projector}) | ({"shots": shots} if shots else {})
     if changes:
         job = job.model_copy(update={"recipe": Recipe.model_validate(job.recipe.model_dump() | changes)})
-    first, *more = (pair(scene, light, seed + i) for i, light in enumerate(job.recipe.lights))
+    first, *more = (pair(scene, light, seed + i, keep) for i, light in enumerate(job.recipe.lights))
     request = Request.model_validate({"frame": frame})
     return Paper(CycleInput(1, first, exam.rig(world), job, request, simulated=True, more=tuple(more)), scene)
 
@@ -72,11 +74,17 @@ def for_method(asked: Paper, method: str) -> Paper:
     return replace(asked, inputs=replace(asked.inputs, job=job.model_copy(update={"recipe": recipe})))
 
 
-def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:
+def pair(scene: WorldScene, light: Light, shot: int, keep: Archive = NOWHERE) -> StereoPair:
     """What both cameras take of a scene; another shot number has other noise. Raises InputError for an unknown pattern."""
+    rig = exam.rig(scene.world)
+
+    def image(index: int) -> Image:
+        return keep.picture(rig, scene, index, light, shot,
+                            lambda: renderer(scene.world).expose(scene, index, light, shot))
+
     left, right = (
         Frame(
-            image=renderer(scene.world).expose(scene, index, light, shot),
+            image=image(index),
             camera=name,
             sequence=1,
             frame_id=1,
@@ -89,6 +97,12 @@ def pair(scene: WorldScene, light: Light, shot: int) -> StereoPair:
         for index, name in enumerate(("left", "right"))
     )
     return StereoPair(left=left, right=right, captured_at="2026-01-01T00:00:00Z", skew_us=0.0, sigma_us=0.0, proof="simulated")
+
+
+def settings_sha256(world: str, *tools: str) -> str:
+    """Names all settings of a cell whose tools are the defaults of these kinds."""
+    numbered = [{"number": i, "kind": kind} for i, kind in enumerate(tools, start=1)]
+    return hashlib.sha256(exam.cell(world, tools=numbered).model_dump_json().encode()).hexdigest()
 
 
 def wilson(good: int, of: int) -> tuple[float, float]:

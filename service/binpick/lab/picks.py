@@ -1,5 +1,6 @@
 """First cycles over kinds of parts, per tool: the judge's word on each grasp, and which parts are one segment."""
 
+import functools
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ import numpy as np
 
 from binpick import pipeline
 from binpick.lab import exam, grasps, offsets, parts
+from binpick.lab.archive import NOWHERE, Archive
 from binpick.lab.exam import Paper
 from binpick.lab.parts import PartScore
 from binpick.result import CycleResult
@@ -65,10 +67,16 @@ class Sheet:
     others: tuple[Tried, ...] = ()
 
 
-def sit(world: str, seeds: Iterable[int], count: int) -> Iterator[Sheet]:
+def sit(world: str, seeds: Iterable[int], count: int, keep: Archive = NOWHERE, projector: bool = True) -> Iterator[Sheet]:
     """All bins of `count` parts, kind by kind. Raises InputError for an unknown world."""
     for kinds, seed in itertools.product(MIXES, seeds):
-        yield sheet(exam.paper(world, seed, kinds=kinds, parts=count), kinds)
+        facts = {"first": kinds, "world": world, "seed": seed, "parts": count, "projector": projector,
+                 "settings": exam.settings_sha256(world, *KINDS)}
+        yield keep.sheet(Sheet, facts, functools.partial(_sheet, world, seed, kinds, count, projector, keep))
+
+
+def _sheet(world: str, seed: int, kinds: str, count: int, projector: bool, keep: Archive) -> Sheet:
+    return sheet(exam.paper(world, seed, kinds=kinds, parts=count, projector=projector, keep=keep), kinds)
 
 
 def sheet(paper: Paper, kinds: str) -> Sheet:

@@ -61,9 +61,9 @@ def row(tool: str, picks: Sequence[Pick]) -> Figures:
     depths = [grip.penetration_m for pick in picks for grip in pick.grips]
     return {
         "scenes": len(picks),
-        "with_grasp": _share(sum(bool(pick.grips) for pick in picks), len(picks)),
-        "p_at_1": _share(sum(pick.grips[0].ok for pick in picks if pick.grips), len(picks)),
-        "p_at_5": _share(sum(grip.ok for grip in five), len(five)),
+        "with_grasp": share(sum(bool(pick.grips) for pick in picks), len(picks)),
+        "p_at_1": share(sum(pick.grips[0].ok for pick in picks if pick.grips), len(picks)),
+        "p_at_5": share(sum(grip.ok for grip in five), len(five)),
         "collisions": sum(depth > score.MAX_PENETRATION_M for depth in depths),
         "penetration_max_mm": round(1000 * max(depths, default=0.0), 2),
         "codes": {str(code): times for code, times in sorted(Counter(pick.code for pick in picks).items())},
@@ -76,10 +76,10 @@ def row(tool: str, picks: Sequence[Pick]) -> Figures:
 
 def recall(found: Sequence[PartScore]) -> Figures:
     """Parts in plain view that are one segment, at the intersection over union of `parts.HALF`."""
-    return _share(*parts.recall(found))
+    return share(*parts.recall(found))
 
 
-def _share(good: int, of: int) -> Figures:
+def share(good: int, of: int) -> Figures:
     """A share with its 95 % interval, which takes each for itself: several grasps of one scene are less certain than that."""
     low, high = exam.wilson(good, of)
     return {"good": good, "of": of, "share": round(good / of, 3) if of else None, "interval": [round(low, 3), round(high, 3)]}
@@ -89,7 +89,7 @@ def _sigma(picks: Sequence[Pick]) -> Figures:
     """How many of the grasps that hold have their TCP within 1 and 2 sigma of the true surface, along the approach."""
     holding = [grip for pick in picks for grip in pick.grips if grip.ok]
     ratios = np.array([abs(grip.off_m) / grip.sigma_z_m for grip in holding])
-    within = {f"within_{limit}": _share(int((ratios <= limit).sum()), ratios.size) for limit in (1, 2)}
+    within = {f"within_{limit}": share(int((ratios <= limit).sum()), ratios.size) for limit in (1, 2)}
     return {"median_mm": round(1000 * float(np.median([grip.sigma_z_m for grip in holding])), 3) if holding else None, **within}
 
 
@@ -126,7 +126,7 @@ def tables(run: Figures) -> Group:
                            end_section=mix == "all")
     whole = Table(f"parts seen {parts.PLAIN_VIEW:.0%} and more", f"one segment (IoU > {parts.HALF:.1f})", "share (95 %)")
     for mix, found in run["segments"].items():
-        whole.add_row(mix, _of(found), _percent(found))
+        whole.add_row(mix, _of(found), percent(found))
     return Group(grips, OFF, offsets.table(run["tools"]), whole, stages, _beside(run["methods"]))
 
 
@@ -157,7 +157,8 @@ def _range(share: Figures) -> str:
     return f"{_of(share)} ({low:.2f}-{high:.2f})"
 
 
-def _percent(share: Figures) -> str:
+def percent(share: Figures) -> str:
+    """A share with its interval, for people."""
     low, high = share["interval"]
     return "-" if share["share"] is None else f"{share['share']:.1%} ({low:.1%} to {high:.1%})"
 
