@@ -68,6 +68,13 @@ def test_a_file_that_cannot_be_a_tool_is_refused(folder, file, unit, fault):
         loaded(folder, file, unit)
 
 
+def test_a_recorded_job_holds_the_tool_without_its_file(folder):
+    job = settings.resolve(loaded(folder, "box.stl"))
+    again = settings.Job.model_validate_json(job.model_dump_json())
+    assert again == job
+    assert len(again.tool.bodies[0].corners_m) == 8
+
+
 def test_a_mesh_that_was_never_read_is_not_taken_for_free():
     body = Mesh(shape="mesh", file="box.stl", unit="mm")
     with pytest.raises(SettingsError, match="was not read"):

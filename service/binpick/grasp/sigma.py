@@ -29,6 +29,8 @@ STEADY_RAD = np.radians(0.25)
 """Tilt that stays where nothing else errs: a surface's own unevenness."""
 EDGE_M = 0.0004
 """How far off the border of what is seen around a lip is, where the lip was centred between borders."""
+STEADY_M = 0.00006
+"""Across the approach, what stays where nothing else errs: the pixels that a lip is centred by."""
 ASLANT = 0.4
 """What a wrong depth moves across the approach, as a share of it: the surface is looked at up to 30° aslant."""
 HELD = {"surface": 0.46, "angle_m": 0.003}
@@ -63,7 +65,8 @@ def of_cups(sigma_px_m: Values, rms_m: Values, support: Int32[np.ndarray, "n"], 
     radius_m = 2 * float(np.sqrt(np.linalg.eigvalsh(at.T @ at / len(at) + discs)[0]))
     noise_m = np.sqrt((sigma_px_m**2 + rms_m**2) * CORRELATED_PX / np.maximum(support, CORRELATED_PX))
     z_m = np.sqrt(noise_m**2 + (SHARED * sigma_px_m) ** 2 + (CURVED * curved * sigma_px_m) ** 2)
-    return Sigmas(xy_m=np.hypot(ASLANT * z_m, EDGE_M * np.maximum(at_edge, curved)), z_m=z_m,
+    across_m = np.sqrt(STEADY_M**2 + (ASLANT * z_m) ** 2 + (EDGE_M * np.maximum(at_edge, curved)) ** 2)
+    return Sigmas(xy_m=across_m, z_m=z_m,
                   tilt_rad=np.hypot(TILTED * noise_m / radius_m, STEADY_RAD))
 
 
