@@ -130,8 +130,8 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     counts |= gate_counts
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
-    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames)})
-    return replace(seen, result=result, segments=segments)
+    located = {"parts": part_messages(parts, inputs, frames)}
+    return replace(seen, result=result.model_copy(update=located), segments=segments)
 
 
 def _candidates(segments: Segments, sigma_z_m: Float32[np.ndarray, "h w"], scene: clearance.Obstacles, job: Job,
