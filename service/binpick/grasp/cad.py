@@ -18,8 +18,9 @@ FIRST, SECOND = 100, 20
 """How many hypotheses the first and the second look leave."""
 LEAST_SCORE, LEAST_LEAD, LEAST_FIT = 0.62, 0.12, 0.88
 """What a pose needs: its score, by which share of it it leads the next one, and the share of the points it explains."""
-MOST_AGAINST, MOST_UNMEASURED, MOST_OUTSIDE = 0.10, 0.20, 0.05
-"""What it may have: of what should be seen of the part, that speaks against it or is not measured; of all, in the floor."""
+MOST_AGAINST, MOST_DEEP, MOST_UNMEASURED, MOST_OUTSIDE = 0.10, 0.02, 0.20, 0.05
+"""What it may have: of what should be seen of the part, what speaks against it, is seen through away from edges, or is not
+measured; of all of it, what lies in the floor."""
 LEAST_POINTS = 250
 """A smaller segment may be the end of many things."""
 RIVAL_M = 0.0015
@@ -136,7 +137,7 @@ def _sound(evidence: Evidence, scores: Float64[np.ndarray, "h"]) -> Bool[np.ndar
     """Which hypotheses hold by themselves, rivals aside."""
     e = evidence
     return np.asarray((scores >= LEAST_SCORE) & (e.fits >= LEAST_FIT) & (e.against <= MOST_AGAINST)
-                      & (e.unmeasured <= MOST_UNMEASURED) & (e.outside <= MOST_OUTSIDE))
+                      & (e.deep <= MOST_DEEP) & (e.unmeasured <= MOST_UNMEASURED) & (e.outside <= MOST_OUTSIDE))
 
 
 def score(evidence: Evidence) -> Float64[np.ndarray, "h"]:

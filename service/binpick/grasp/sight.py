@@ -13,9 +13,11 @@ from binpick.grasp.align import Cloud, Normal, Poses
 from binpick.grasp.shape import Shape
 
 BEHIND_M = 0.002
-"""Further behind a point than this, the camera sees through it; further in front, it is hidden. Twice the noise of depth."""
+"""Further behind a point than this, the camera sees through it; further in front, it is hidden."""
 STEP_M = 0.0025
 """What lies further behind the nearest pixel of a segment than this is background."""
+DEEP_M = 0.0015
+"""What is seen through further inside the background than this is no blur of an edge."""
 GRAZING = 0.25
 """Surfaces seen at a smaller cosine than this are not asked for: stereo does not measure them."""
 
@@ -138,15 +140,16 @@ class Evidence:
     """What speaks for each hypothesis, as shares.
 
     Of the segment's points: `fits`, those on the part's surface with its normal there. Of what the camera should see of the
-    part: `there` it measured it, on this segment; `other` as well, but on another one; `through` it saw something behind;
-    `before` this very segment lies in front of it; `hidden` something else does; the rest is not measured. Of all of the
-    part: `outside`, what would lie in the bin's floor or walls.
+    part: `there` it measured it, on this segment; `other` as well, but on another one; `through` it saw something behind,
+    `deep` likewise, but away from the segment's edge; `before` this very segment lies in front of it; `hidden` something else
+    does; the rest is not measured. Of all of the part: `outside`, what would lie in the bin's floor or walls.
     """
 
     fits: Float64[np.ndarray, "h"]
     there: Float64[np.ndarray, "h"]
     other: Float64[np.ndarray, "h"]
     through: Float64[np.ndarray, "h"]
+    deep: Float64[np.ndarray, "h"]
     before: Float64[np.ndarray, "h"]
     hidden: Float64[np.ndarray, "h"]
     outside: Float64[np.ndarray, "h"]
@@ -183,5 +186,7 @@ def evidence(poses: Poses, shape: Shape, sight: Sight, target: Target, inside: t
     placed = poses.placed(shape.points)
     low, high = (corner.astype(np.float32) for corner in inside)
     outside = ((placed < low) | (placed > high)).any(axis=2).mean(axis=1)
-    return Evidence(fit.mean(axis=1).astype(np.float64), share(near & mine), share(near & ~mine & (owner > 0)), share(behind),
-                    share(front & mine), share(front & ~mine), outside.astype(np.float64))
+    deep = behind & (target.beyond_m[spots.row, spots.col] > DEEP_M)
+    return Evidence(fits=fit.mean(axis=1).astype(np.float64), there=share(near & mine), other=share(near & ~mine & (owner > 0)),
+                    through=share(behind), deep=share(deep), before=share(front & mine), hidden=share(front & ~mine),
+                    outside=outside.astype(np.float64))
