@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from binpick.geometry import Vector
+
 EVEN_M = 0.0006
 """So far, root mean square, the points may lie off the circle: two sigma of depth at 1 m."""
 SEEN = 0.6
@@ -13,6 +15,13 @@ BULGE_M = 0.001
 """What bulges less is flat."""
 HIDDEN_M = 0.001
 """So far what is seen may reach beyond the circle."""
+
+UPRIGHT = 0.5
+"""Sine of the angle to the vertical below which a bar stands: its side is not seen."""
+ALMOST = 0.98
+"""Share of a part's points that tell how wide it is seen."""
+ROUNDS, ASTRAY_M, MOSTLY = 3, 0.0015, 0.9
+"""A whole part's points further off its circle than this are ends and edges; most must be nearer."""
 
 Values = Float64[np.ndarray, "n"]
 
@@ -50,3 +59,43 @@ def circles(sums: Float64[np.ndarray, "9 n"], low_m: Values, high_m: Values) -> 
     fits &= (radius - np.sqrt(np.maximum(radius * radius - width * width / 4, 0)) > BULGE_M) & (z_m > z / n)
     enough = width > SEEN * 2 * radius
     return Circles(x_m, z_m, radius, fits & enough, fits & ~enough)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bar:
+    """A round bar, frame `bin`: a point of its axis, and the axis, a unit vector."""
+
+    middle: Vector
+    axis: Vector
+
+    def outwards(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Unit vectors away from the axis, at each point."""
+        off = points - self.middle
+        off -= (off @ self.axis)[:, None] * self.axis
+        outwards: Float64[np.ndarray, "n 3"] = off / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-9)
+        return outwards
+
+
+def bar(points: Float64[np.ndarray, "k 3"], normals: Float64[np.ndarray, "k 3"]) -> Bar | None:
+    """The bar that a part's points and normals (frame `bin`, seen from above) show; None when it is none.
+
+    Its axis is the direction that the normals avoid.
+    """
+    axis = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    up = np.array([0.0, 0.0, 1.0]) - axis * axis[2]
+    height = float(np.linalg.norm(up))
+    if height < UPRIGHT:
+        return None
+    up /= height
+    across, middle = np.cross(axis, up), points.mean(axis=0)
+    x, z = (points - middle) @ across, (points - middle) @ up
+    low, high = (np.quantile(x, share)[None] for share in (1 - ALMOST, ALMOST))
+    near = np.ones(len(x), dtype=bool)
+    for _ in range(ROUNDS):
+        found = circles(moments(x[near], z[near]).sum(axis=1)[:, None], low, high)
+        off = np.hypot(x - found.x_m, z - found.z_m) - found.radius_m
+        near = np.abs(off) < ASTRAY_M
+    wide = SEEN * 2 * found.radius_m[0] < high[0] - low[0] < 2 * found.radius_m[0] + 2 * HIDDEN_M
+    if near.mean() < MOSTLY or not wide:
+        return None
+    return Bar(middle + found.x_m[0] * across + found.z_m[0] * up, axis)

@@ -1,10 +1,10 @@
 """Suction grasps: where every lip of the tool lies on one part within its compliance, on measured points only."""
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from binpick.data import Grasp, Segments
-from binpick.grasp import sigma
+from binpick.grasp import bars, sigma
 from binpick.grasp.seal import Seal, on_one_part, seal
 from binpick.grasp.spots import Patch, centred, frames, long_axis, patches, spacing, spots
 from binpick.settings import SuctionTool
@@ -18,6 +18,9 @@ CENTRINGS = 3
 FLAT_RAD, CURVED_RAD = 0.08, 0.16
 """Normals under the lips that turn by less are noise, by more a curve (tuning seeds: 97 % of flat faces below 0.09, 95 % of the
 cylinders above): only on a curve does the middle of a lip lie above the plane. In between it counts in part."""
+
+ON_THE_SIDE = float(np.cos(np.radians(25)))
+"""A lip on a bar's side, not on its end."""
 
 
 def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndarray, "h w"],
@@ -77,6 +80,7 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
     T, upwards, under, place = T_bin_spot[chosen], normal[chosen], fit.under[chosen], patch.place[chosen]
     curved = np.clip((_turn(segments, upwards, under, place) - FLAT_RAD) / (CURVED_RAD - FLAT_RAD), 0, 1)
     origin = T[:, :3, 3] + T[:, :3, 2] * (fit.level_m[chosen] + curved * fit.centre_m[chosen])[:, None]
+    upwards = _off_axis(segments, part, curved > 0, origin, upwards)
     hint = _long_axes(segments, part) if len(tool.cups) == 1 else T[:, :3, 0]
     T_bin_tcp = frames(-upwards, hint, origin)
     sigma_px_m = _mean(sigma_z_m.ravel().take(place).astype(np.float64), under)
@@ -86,6 +90,19 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
               seal_m=float(fit.bend_m[i]), room=float(fit.room[i]), sigma_xy_m=float(off.xy_m[n]), sigma_z_m=float(off.z_m[n]),
               sigma_tilt_rad=float(off.tilt_rad[n]))
         for n, (i, label) in enumerate(zip(chosen.tolist(), part.tolist(), strict=True))]
+
+
+def _off_axis(segments: Segments, part: Int32[np.ndarray, "n"], curved: Bool[np.ndarray, "n"],
+              origin: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """The normals, but on round bars away from the bar's axis: a plane under the lip leans a third too little there."""
+    normal = normal.copy()
+    for label in np.unique(part[curved]).tolist():
+        whole = segments.parts == label
+        if (found := bars.bar(*(field[whole].astype(np.float64) for field in (segments.xyz, segments.normal)))) is not None:
+            away = found.outwards(origin)
+            mine = (part == label) & (np.einsum("nc,nc->n", away, normal) > ON_THE_SIDE)
+            normal[mine] = away[mine]
+    return normal
 
 
 def _turn(segments: Segments, normal: Float64[np.ndarray, "n 3"], under: np.ndarray, place: Int64[np.ndarray, "n k"],
