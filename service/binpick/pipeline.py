@@ -69,9 +69,13 @@ def run(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
 
 
 def poses(inputs: CycleInput, cycle: CycleResult, proceed: Proceed = lambda: None) -> CycleResult:
-    """The same cycle with its parts' poses, if the recipe has a mesh and they were not needed for its grasps."""
+    """The same cycle with its parts' poses, if the recipe has a mesh and they were not needed for its grasps.
+
+    A code without grasps has no poses of parts either: there are poses, or there is a reason.
+    """
     mesh, segments = inputs.job.recipe.mesh, cycle.segments
-    if mesh is None or mesh.grasps or segments is None or cycle.rectified is None or cycle.T_camera_bin is None:
+    wanted = mesh is not None and not mesh.grasps and cycle.result.return_code.code.carries_poses
+    if not wanted or segments is None or cycle.rectified is None or cycle.T_camera_bin is None:
         return cycle
     clock = _Clock(proceed)
     frames = replace(Frames.of(inputs), T_camera_bin=cycle.T_camera_bin)
@@ -146,7 +150,7 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
               **clear_counts, **gate_counts}
     code = code_of(filled, counts, messages)
     result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
-    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames)})
+    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames) if code.carries_poses else ()})
     T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
     return replace(seen, result=result, segments=segments, verified=verdicts,
                    memory=memory.looked(inputs, result.grasps, T_bin_frame, heights, segments))
