@@ -19,7 +19,8 @@ from binpick.sim import oracle
 from binpick.sim.world import ScenePart, WorldScene
 
 FINGERS = TwoFingerTool(kind="two_finger")
-PICKED = Cycle(0, 1000.0, Taken("suction", "block", "", 0.0))
+PICKED = Cycle(0, 1000.0, Taken("suction", "block", "", 0.0, lifted=True))
+DROPPED = Cycle(0, 1000.0, Taken("suction", "bracket", "", 0.0))
 MISSED = Cycle(0, 1000.0, Taken("suction", "block", "the cup is not on one part", 0.0))
 HIT = Cycle(0, 1000.0, Taken("suction", "block", "the tool collides", 0.0021))
 
@@ -36,6 +37,11 @@ def test_what_left_and_what_could_have_left_are_counted():
     assert row["misses"] == {"the cup is not on one part": 1}
     assert (row["cycles"], row["codes"]) == (4, {"103": 1})
     assert row["parts_per_hour"] == round(2 / 3.5 * 3600)
+
+
+def test_grasps_that_hold_are_lifted_or_not():
+    row = harvest.row([emptied(PICKED, DROPPED, MISSED, HIT)])
+    assert (row["lifted"]["good"], row["lifted"]["of"]) == (1, 2)
 
 
 def test_a_collision_counts_and_a_part_that_an_empty_bin_shows_too():

@@ -4,16 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from binpick import pipeline
 from binpick.errors import InputError
-from binpick.lab import exam, film
+from binpick.lab import film
 
 
-def test_frames_are_small_overlays():
-    paper = exam.paper("A", 1, parts=2)
-    picture = film.frame(paper.inputs, pipeline.run(paper.inputs))
-    assert picture.shape[1] == film.WIDTH_PX
-    assert picture.std() > 10
+@pytest.mark.slow
+def test_a_bin_is_filmed_until_it_is_empty():
+    frames = list(film.shoot("A", 1, 1))
+    assert len(frames) == 2
+    assert {frame.shape[1] for frame in frames} == {film.WIDTH_PX}
+    assert np.abs(frames[0].astype(float) - frames[1]).mean() > 0.5
 
 
 def test_a_film_has_all_frames(tmp_path):
@@ -29,3 +29,5 @@ def test_a_film_has_all_frames(tmp_path):
 def test_a_file_that_cannot_move_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"\.webp"):
         film.save([np.zeros((4, 4, 3), np.uint8)], tmp_path / "film.jpg")
+    with pytest.raises(InputError, match="no folder"):
+        film.save(iter(()), tmp_path / "nowhere" / "film.webp")

@@ -68,22 +68,33 @@ def grasp(
     tuning: Annotated[bool, typer.Option("--tuning", help="Sit seeds 1 to 10, on which settings are fitted.")] = False,
     folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Keeps finished sheets and pictures: a run goes on where "
                                                 "it ended. Else the user's cache.")] = None,
+    picture: Annotated[Path | None, typer.Option("--film", metavar="FILE", help="Instead empty the first seed's mixed bin by "
+                                                 "both tools, as an animated .webp.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """First cycles over kinds of parts, per tool, and bins emptied: grasps, segments, sigma, stages against the truth."""
     import json
 
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, track
 
-    from binpick.lab import archive, harvest, programme, tally
+    from binpick.errors import InputError
+    from binpick.lab import archive, film, harvest, programme, tally
     from binpick.sim import exam as frozen
 
+    if gate and full:
+        raise InputError("--gate is a part of what --full does: give one of them")
+    keep = archive.Archive(folder or archive.default())
     chosen = programme.GATE if gate else programme.FULL if full else (programme.Bins(world, parts, scenes, clear),)
     seeds = frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS
+    if picture is not None:
+        frames = track(film.shoot(world, seeds[0], parts, keep), "Filming", total=parts + 1, console=Console(stderr=True),
+                       transient=True)
+        film.save(frames, picture)
+        return
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("Picking", total=sum(bins.sheets for bins in chosen))
-        run = programme.run(chosen, seeds, archive.Archive(folder or archive.default()), lambda: progress.advance(task))
+        run = programme.run(chosen, seeds, keep, lambda: progress.advance(task))
     if as_json:
         typer.echo(json.dumps(run, indent=1))
         return

@@ -15,7 +15,7 @@ from binpick.lab.exam import Paper
 from binpick.outcomes import COLLISION, MISSED, NO_MEMORY, OK, Memory
 from binpick.result import CycleInput, CycleResult, Request, Result
 from binpick.sim import exam as frozen
-from binpick.sim import oracle, score
+from binpick.sim import lift, oracle, score
 from binpick.sim.score import Verdict
 from binpick.sim.world import World, WorldScene
 
@@ -44,12 +44,16 @@ TASKS = (Task("block", ("suction",)), Task("mixed", ("suction",)), Task("cylinde
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """The first grasp of a cycle as the robot took it; `reason` is the judge's, "" when it holds a part of `kind`."""
+    """The first grasp of a cycle as the robot took it; `reason` is the judge's, "" when it holds a part of `kind`.
+
+    `lifted`: the part also stayed in the hand when physics lifted it; not asked of grasps that do not hold.
+    """
 
     tool: str
     kind: str
     reason: str
     penetration_m: float
+    lifted: bool = False
 
     @property
     def collides(self) -> bool:
@@ -128,8 +132,10 @@ def steps(task: Task, world: World, parts: int, keep: Archive = NOWHERE, project
         paper = _paper(task, world.scene(), number, known, keep, projector)
         outcome = pipeline.run(paper.inputs)
         result = outcome.result
-        verdict = grasps.judged(paper, [grasps.taken(grasp) for grasp in result.grasps[:1]])
-        yield Step(paper, outcome, _cycle(result, verdict))
+        first = [grasps.taken(grasp) for grasp in result.grasps[:1]]
+        verdict = grasps.judged(paper, first)
+        lifted = [_lifted(paper, *each) for each in zip(first, verdict, strict=True)]
+        yield Step(paper, outcome, _cycle(result, verdict, lifted))
         if not verdict:
             return
         known = memory.after(known, outcome, {result.grasps[0].number: _outcome(verdict[0])})
@@ -138,9 +144,15 @@ def steps(task: Task, world: World, parts: int, keep: Archive = NOWHERE, project
             world.settle()
 
 
-def _cycle(result: Result, verdicts: Sequence[Verdict]) -> Cycle:
-    taken = [Taken(result.grasps[0].tool.kind, v.kind, v.reason, v.penetration_m) for v in verdicts]
+def _cycle(result: Result, verdicts: Sequence[Verdict], lifted: Sequence[bool]) -> Cycle:
+    taken = [Taken(result.grasps[0].tool.kind, v.kind, v.reason, v.penetration_m, up)
+             for v, up in zip(verdicts, lifted, strict=True)]
     return Cycle(result.return_code.value, result.timing_ms["compute"], taken[0] if taken else None)
+
+
+def _lifted(paper: Paper, first: grasps.Taken, verdict: Verdict) -> bool:
+    tool = paper.inputs.job.tool_numbered(first.tool)
+    return verdict.ok and lift.lift(paper.scene, first.T_bin_tcp, tool, verdict.part_id, first.open_m).held
 
 
 def _outcome(verdict: Verdict) -> int:

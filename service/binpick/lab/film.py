@@ -1,6 +1,6 @@
 """A film of a bin being emptied: one overlay a cycle, as an animated picture for people."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -9,7 +9,11 @@ from jaxtyping import UInt8
 
 from binpick import artefacts
 from binpick.errors import InputError
+from binpick.lab import clearing
+from binpick.lab.archive import NOWHERE, Archive
+from binpick.lab.clearing import TASKS
 from binpick.result import CycleInput, CycleResult
+from binpick.sim.world import World
 
 WIDTH_PX = 640
 FRAME_MS, LAST_MS = 700, 3000
@@ -17,6 +21,13 @@ SUFFIX = ".webp"
 QUALITY = 70
 """Dots and grain are most of the bytes, and nobody looks at them."""
 Picture = UInt8[np.ndarray, "h w 3"]
+
+
+def shoot(world: str, seed: int, parts: int, keep: Archive = NOWHERE) -> Iterator[Picture]:
+    """A bin of mixed parts, emptied by both tools: a frame a cycle. Raises InputError for an unknown world."""
+    task = TASKS[-1]
+    for step in clearing.steps(task, World(world, task.kinds, parts, seed), parts, keep):
+        yield frame(step.paper.inputs, step.outcome)
 
 
 def frame(inputs: CycleInput, cycle: CycleResult) -> Picture:
@@ -31,6 +42,8 @@ def save(frames: Iterable[Picture], path: Path) -> None:
     """Writes the film; it starts again at its end. Raises InputError for a kind of file that cannot move."""
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: a film is a {SUFFIX} file")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}")
     film = cv2.Animation()
     film.frames = list(frames)
     film.durations = [FRAME_MS] * (len(film.frames) - 1) + [LAST_MS]

@@ -30,6 +30,7 @@ def row(bins: Sequence[Clearing]) -> Figures:
         "removed": share(removed, removed + sum(part.pickable for part in stayed)),
         "stayed": dict(sorted(Counter(part.kind for part in stayed if part.pickable).items())),
         "held": share(sum(not grasp.reason for grasp in taken), len(taken)),
+        "lifted": share(sum(grasp.lifted for grasp in taken), sum(not grasp.reason for grasp in taken)),
         "misses": dict(Counter(grasp.reason for grasp in taken if grasp.reason).most_common()),
         "collisions": sum(grasp.collides for grasp in taken),
         "penetration_max_mm": round(1000 * max((grasp.penetration_m for grasp in taken), default=0.0), 2),
@@ -46,13 +47,14 @@ def _overlooks(one: Clearing) -> bool:
 
 def table(rows: dict[str, Figures]) -> Table:
     """The same for people."""
-    shown = Table("emptied by", "bins", "pickable taken", "share (95 %)", "cycles", "held", "misses", "collisions (worst)",
-                  "last codes", "102, part in view", "parts/h", title="Bins emptied in a closed loop", title_justify="left")
+    shown = Table("emptied by", "bins", "pickable taken", "share (95 %)", "cycles", "held", "lifted", "misses",
+                  "collisions (worst)", "last codes", "102, part in view", "parts/h", title="Bins emptied in a closed loop",
+                  title_justify="left")
     for name, each in rows.items():
         if each["bins"]:
-            misses, removed, held = each["misses"], each["removed"], each["held"]
+            misses, removed, held, lifted = (each[name] for name in ("misses", "removed", "held", "lifted"))
             shown.add_row(name, str(each["bins"]), f"{removed['good']}/{removed['of']}", percent(removed), str(each["cycles"]),
-                          f"{held['good']}/{held['of']}",
+                          f"{held['good']}/{held['of']}", f"{lifted['good']}/{lifted['of']}",
                           ", ".join(f"{times} {reason}" for reason, times in misses.items()) or "-",
                           f"{each['collisions']} ({each['penetration_max_mm']:.1f} mm)",
                           " ".join(f"{code}: {times}" for code, times in each["codes"].items()),
