@@ -95,13 +95,13 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
 def _off_axis(segments: Segments, part: Int32[np.ndarray, "n"], curved: Bool[np.ndarray, "n"],
               origin: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     """The normals, but on round bars away from the bar's axis: a plane under the lip leans a third too little there."""
-    normal = normal.copy()
+    normal, fields = normal.copy(), [field.reshape(-1, 3) for field in (segments.xyz, segments.normal)]
     for label in np.unique(part[curved]).tolist():
-        whole = segments.parts == label
-        if (found := bars.bar(*(field[whole].astype(np.float64) for field in (segments.xyz, segments.normal)))) is not None:
+        mine = np.flatnonzero(segments.parts == label)
+        if (found := bars.bar(*(field[mine].astype(np.float64) for field in fields))) is not None:
             away = found.outwards(origin)
-            mine = (part == label) & (np.einsum("nc,nc->n", away, normal) > ON_THE_SIDE)
-            normal[mine] = away[mine]
+            lips = (part == label) & (np.einsum("nc,nc->n", away, normal) > ON_THE_SIDE)
+            normal[lips] = away[lips]
     return normal
 
 
