@@ -121,6 +121,7 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
         eyes_bin = cloud.eyes(rectified, geometry.inverse(frames.T_camera_bin))
         heights = heightmap.height_map(grid.xyz, job.bin, eyes_bin)
         filled = load_carrier.filling(heights, job.bin, job.recipe.part)
+        scene = clearance.obstacles(heights, job.bin)
     seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points,
                        T_camera_bin=frames.T_camera_bin)
     if measured < LEAST_MEASURED:
@@ -130,10 +131,30 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
         inputs = replace(inputs, memory=memory.standing(inputs.memory, heights, inputs.pair.captured_at, verdicts))
     with clock.stage("segment"):
         segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
-    with clock.stage("grasp"):
-        scene = clearance.obstacles(heights, job.bin)
-        found, counts = _candidates(segments, grid.sigma_z_m, scene, job)
+    found, counts, parts = _offered(inputs, frames, clock, rectified, segments, grid.sigma_z_m, scene)
+    with clock.stage("clearance"):
+        kept, clear_counts = _clear(found, segments, heights, scene, inputs)
+    messages, gate_counts = publishable(kept, inputs, frames)
+    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **clear_counts,
+              **gate_counts}
+    code = code_of(filled, counts, messages)
+    published = messages if code.carries_poses else ()
+    with clock.stage("remember"):
+        T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
+        after = memory.looked(inputs, published, T_bin_frame, heights, segments)
+    result = answer(inputs, frames, clock.spent(), code, filled, published, counts)
+    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames) if code.carries_poses else ()})
+    return replace(seen, result=result, segments=segments, verified=verdicts, memory=after)
+
+
+def _offered(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Rectified, segments: Segments,
+             sigma_z_m: Float32[np.ndarray, "h w"], scene: clearance.Obstacles,
+             ) -> tuple[list[Grasp], dict[str, int], tuple[PartPose, ...]]:
+    """What the tools could grip and the limits let through, taught grasps included, and the poses that those needed."""
+    job = inputs.job
     parts: tuple[PartPose, ...] = ()
+    with clock.stage("grasp"):
+        found, counts = _candidates(segments, sigma_z_m, scene, job)
     if job.recipe.mesh is not None and job.recipe.mesh.grasps:
         with clock.stage("pose"):
             ranked = (grasp.part_id for grasp in rank.ordered(found, segments, *job.tools))
@@ -143,17 +164,7 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
     if (inputs.request.frame or job.recipe.frame) == "base":
         found = sigma.calibrated(found, inputs.rig, frames.T_camera_bin)
     found, limited = admission.admitted(found, job)
-    with clock.stage("clearance"):
-        kept, clear_counts = _clear(found, segments, heights, scene, inputs)
-    messages, gate_counts = publishable(kept, inputs, frames)
-    counts = {"faces": int(segments.faces.max(initial=0)), "parts": len(segments.part_confidence), **counts, **limited,
-              **clear_counts, **gate_counts}
-    code = code_of(filled, counts, messages)
-    result = answer(inputs, frames, clock.spent(), code, filled, messages if code.carries_poses else (), counts)
-    result = result.model_copy(update={"parts": part_messages(parts, inputs, frames) if code.carries_poses else ()})
-    T_bin_frame = geometry.inverse(frames.T_frame_bin(inputs.request.frame or job.recipe.frame))
-    return replace(seen, result=result, segments=segments, verified=verdicts,
-                   memory=memory.looked(inputs, result.grasps, T_bin_frame, heights, segments))
+    return found, {**counts, **limited}, parts
 
 
 def _candidates(segments: Segments, sigma_z_m: Float32[np.ndarray, "h w"], scene: clearance.Obstacles, job: Job,
