@@ -60,9 +60,9 @@ def paper(world: str, seed: int, *, kinds: str = "mixed", parts: int = 25, recip
     return Paper(CycleInput(1, first, exam.rig(world), job, request, simulated=True, more=tuple(more)), scene)
 
 
-def for_tool(asked: Paper, kind: str) -> Paper:
-    """The same frames for a cell whose one tool is the default of that kind."""
-    tools = exam.cell(asked.scene.world, tools=[{"kind": kind}]).tools
+def for_tool(asked: Paper, *kinds: str) -> Paper:
+    """The same frames for a recipe whose tools are the defaults of those kinds."""
+    tools = exam.cell(asked.scene.world, tools=[{"number": i, "kind": kind} for i, kind in enumerate(kinds, start=1)]).tools
     return replace(asked, inputs=replace(asked.inputs, job=asked.inputs.job.model_copy(update={"tools": tools})))
 
 
