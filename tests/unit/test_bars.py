@@ -53,5 +53,12 @@ def test_two_sides_of_a_roof_are_no_bar():
     assert bar(points, normals) is None
 
 
+def test_points_that_no_circle_comes_near_are_no_bar():
+    rng = np.random.default_rng(4)
+    angle, radius = rng.uniform(-1, 1, 900), np.tile([0.03, 0.05], 450)
+    normals = np.column_stack([np.sin(angle), np.zeros(900), np.cos(angle)])
+    assert bar(radius[:, None] * normals + rng.uniform(-0.02, 0.02, (900, 1)) * [0, 1, 0], normals) is None
+
+
 def test_a_standing_bar_shows_no_side():
     assert bar(*seen_from_above((0.1, 0.0, 1.0))) is None

@@ -95,6 +95,8 @@ def bar(points: Float64[np.ndarray, "k 3"], normals: Float64[np.ndarray, "k 3"])
         found = circles(moments(x[near], z[near]).sum(axis=1)[:, None], low, high)
         off = np.hypot(x - found.x_m, z - found.z_m) - found.radius_m
         near = np.abs(off) < ASTRAY_M
+        if near.sum() < 3:
+            return None
     wide = SEEN * 2 * found.radius_m[0] < high[0] - low[0] < 2 * found.radius_m[0] + 2 * HIDDEN_M
     if near.mean() < MOSTLY or not wide:
         return None

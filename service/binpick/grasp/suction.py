@@ -80,7 +80,7 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
     T, upwards, under, place = T_bin_spot[chosen], normal[chosen], fit.under[chosen], patch.place[chosen]
     curved = np.clip((_turn(segments, upwards, under, place) - FLAT_RAD) / (CURVED_RAD - FLAT_RAD), 0, 1)
     origin = T[:, :3, 3] + T[:, :3, 2] * (fit.level_m[chosen] + curved * fit.centre_m[chosen])[:, None]
-    upwards = _off_axis(segments, part, curved > 0, origin, upwards)
+    upwards = _off_axis(segments, part, curved > 0, origin, upwards, tool)
     hint = _long_axes(segments, part) if len(tool.cups) == 1 else T[:, :3, 0]
     T_bin_tcp = frames(-upwards, hint, origin)
     sigma_px_m = _mean(sigma_z_m.ravel().take(place).astype(np.float64), under)
@@ -93,14 +93,19 @@ def _grasps(chosen: Int64[np.ndarray, "n"], segments: Segments, at: Int32[np.nda
 
 
 def _off_axis(segments: Segments, part: Int32[np.ndarray, "n"], curved: Bool[np.ndarray, "n"],
-              origin: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """The normals, but on round bars away from the bar's axis: a plane under the lip leans a third too little there."""
+              origin: Float64[np.ndarray, "n 3"], normal: Float64[np.ndarray, "n 3"], tool: SuctionTool,
+              ) -> Float64[np.ndarray, "n 3"]:
+    """The normals, but on round bars away from the bar's axis, as far as the tool may tilt.
+
+    A plane under the lip leans a third too little there.
+    """
     normal, fields = normal.copy(), [field.reshape(-1, 3) for field in (segments.xyz, segments.normal)]
     for label in np.unique(part[curved]).tolist():
         mine = np.flatnonzero(segments.parts == label)
         if (found := bars.bar(*(field[mine].astype(np.float64) for field in fields))) is not None:
             away = found.outwards(origin)
             lips = (part == label) & (np.einsum("nc,nc->n", away, normal) > ON_THE_SIDE)
+            lips &= away[:, 2] >= np.cos(tool.max_tilt_rad)
             normal[lips] = away[lips]
     return normal
 
