@@ -55,9 +55,10 @@ def test_two_sides_of_a_roof_are_no_bar():
 
 def test_points_that_no_circle_comes_near_are_no_bar():
     rng = np.random.default_rng(4)
-    angle, radius = rng.uniform(-1, 1, 900), np.tile([0.03, 0.05], 450)
-    normals = np.column_stack([np.sin(angle), np.zeros(900), np.cos(angle)])
-    assert bar(radius[:, None] * normals + rng.uniform(-0.02, 0.02, (900, 1)) * [0, 1, 0], normals) is None
+    x, z = np.tile([-0.02, 0.02, 0.0, 0.0], 225), np.tile([0.0, 0.0, 0.02, -0.03], 225)
+    normals = np.column_stack([rng.normal(0, 0.3, 900), np.zeros(900), np.ones(900)])
+    points = np.column_stack([x, rng.uniform(-0.02, 0.02, 900), z])
+    assert bar(points, normals / np.linalg.norm(normals, axis=1, keepdims=True)) is None
 
 
 def test_a_standing_bar_shows_no_side():
