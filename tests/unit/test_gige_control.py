@@ -6,12 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from binpick.sim.gige.action import Action
 from binpick.sim.gige.control import Control
 from binpick.sim.gige.gvcp import Code, Status
 from binpick.sim.gige.registers import Registers
 
 OWNER, OTHER = ("10.0.0.1", 5000), ("10.0.0.9", 5000)
 CCP, HEARTBEAT, VENDOR = 0xA00, 0x938, 0x48
+KEY = 0xB1D0
 
 
 class Bench:
@@ -21,9 +23,14 @@ class Bench:
         self.registers = Registers("127.0.9.2", 640, 400, "S1")
         self.written: list[str] = []
         self.resends: list[tuple[int, int, int]] = []
+        self.actions: list[Action] = []
         self.releases = 0
         self.control = Control(self.registers, lambda name, _at: self.written.append(name),
-                               lambda *request: self.resends.append(request), self._released)
+                               lambda *request: self.resends.append(request), self._released, self._act)
+
+    def _act(self, action: Action, _arrived_ns: int) -> bool:
+        self.actions.append(action)
+        return action.device_key == KEY
 
     def _released(self) -> None:
         self.releases += 1
@@ -121,6 +128,31 @@ def test_resend_requests_count_for_the_controllers_host_only(bench: Bench) -> No
     assert bench.ask(Code.PACKETRESEND, request, (OWNER[0], 6001), flags=0) is None
     assert bench.ask(Code.PACKETRESEND, request, OTHER, flags=0) is None
     assert bench.resends == [(5, 17, 20)]
+
+
+def test_actions_are_for_controlled_cameras_that_are_meant_and_may_come_from_anybody(bench: Bench) -> None:
+    meant, other = struct.pack(">III", KEY, 1, 1), struct.pack(">III", KEY + 1, 1, 1)
+    assert bench.ask(Code.ACTION, meant, OTHER) is None
+    bench.write(CCP, 2)
+    assert bench.ask(Code.ACTION, meant, OTHER) == bytes.fromhex("00000101 0000 004d")
+    assert bench.ask(Code.ACTION, other, OTHER) is None
+    assert bench.ask(Code.ACTION, meant, flags=0) is None             # nobody asked for an acknowledge
+    assert bench.ask(Code.ACTION, meant + struct.pack(">Q", 5), flags=0x81) is not None
+    assert bench.actions == [Action(KEY, 1, 1), Action(KEY + 1, 1, 1), Action(KEY, 1, 1), Action(KEY, 1, 1, 5)]
+    short = bench.ask(Code.ACTION, meant, flags=0x81)
+    assert short is not None
+    assert struct.unpack_from(">H", short)[0] == Status.INVALID_PARAMETER
+
+
+def test_a_stolen_camera_obeys_nobody_else_until_the_thief_lets_go(bench: Bench) -> None:
+    bench.write(CCP, 2)
+    bench.control.steal(("203.0.113.1", 1))
+    assert bench.releases == 1
+    bench.control.expire(60_000_000_000)
+    assert bench.write(HEARTBEAT, 2000) == Status.ACCESS_DENIED
+    assert bench.write(CCP, 2, OTHER) == Status.ACCESS_DENIED
+    bench.control.steal(None)
+    assert bench.write(CCP, 2) == 0
 
 
 def test_an_unknown_command_is_refused_and_noise_is_not_answered(bench: Bench) -> None:

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as Xml
 
 import pytest
 
-from binpick.sim.gige import features
+from binpick.sim.gige import description, features
 from binpick.sim.gige.gvcp import Fault
 from binpick.sim.gige.registers import Registers
 
@@ -19,7 +19,7 @@ def registers() -> Registers:
 
 
 def test_every_reference_of_the_description_exists() -> None:
-    root = Xml.fromstring(features.description(ROWS))
+    root = Xml.fromstring(description.description(ROWS))
     names = [node.get("Name") for node in root]
     assert len(names) == len(set(names))
     references = {leaf.text for node in root for leaf in node if leaf.tag.removeprefix(SPACE) in
@@ -32,7 +32,8 @@ def test_every_reference_of_the_description_exists() -> None:
 def test_registers_do_not_overlap() -> None:
     taken: dict[int, str] = {}
     for row in ROWS:
-        for address in range(row.address, row.address + row.length * row.count):
+        starts = range(row.address, row.address + row.step * row.count, row.step)
+        for address in (start + byte for start in starts for byte in range(row.length)):
             if row.bits is None:
                 assert address not in taken, (row.name, taken[address])
                 taken[address] = row.name
@@ -49,6 +50,22 @@ def test_a_selector_picks_one_of_several(registers: Registers) -> None:
     line = next(row for row in ROWS if row.name == "LineSource")
     registers.write(line.address + 2 * 4, struct.pack(">I", features.LINE_SOURCES["ExposureActive"]))
     assert [registers.integer("LineSource", index) for index in range(4)] == [0, 0, 4, 0]
+
+
+def test_opto_isolated_lines_cannot_turn_round(registers: Registers) -> None:
+    mode = next(row for row in ROWS if row.name == "LineMode")
+    modes = features.LINE_MODES
+    assert [registers.name("LineMode", index) for index in range(4)] == ["Input", "Input", "Output", "Input"]
+    registers.write(mode.address + 4, struct.pack(">I", modes["Output"]))
+    registers.write(mode.address + 8, struct.pack(">I", modes["Output"]))
+    with pytest.raises(Fault, match="INVALID_PARAMETER"):
+        registers.write(mode.address + 12, struct.pack(">I", modes["Output"]))
+    assert [registers.name("LineMode", index) for index in range(4)] == ["Input", "Output", "Output", "Input"]
+
+
+def test_a_negative_offset(registers: Registers) -> None:
+    registers.set("PtpOffsetFromMaster", -37)
+    assert registers.number("PtpOffsetFromMaster") == -37
 
 
 def test_fields_of_one_register_keep_apart(registers: Registers) -> None:

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from binpick.data import Image
+from binpick.sim.gige import pixels
 from binpick.sim.gige.gvsp import KEPT_BLOCKS, Block, Sender
+from binpick.sim.gige.pixels import Payload
+from binpick.sim.gige.transit import Transit
 
 
 @pytest.fixture
@@ -37,8 +39,8 @@ def received(receiver: socket.socket) -> dict[int, bytes]:
         return packets
 
 
-def image_of(height: int, width: int) -> Image:
-    return np.random.default_rng(3).integers(0, 256, (height, width), np.uint8)
+def image_of(height: int, width: int) -> Payload:
+    return pixels.pack(np.random.default_rng(3).integers(0, 256, (height, width), np.uint8), pixels.FORMATS["Mono8"])
 
 
 def body(packets: dict[int, bytes], block: Block) -> bytes:
@@ -50,7 +52,7 @@ def test_payload_is_the_image(shape: tuple[int, int]) -> None:
     image = image_of(*shape)
     block = Block(9, (5 << 32) + 6, image, 540 + 36)
     packets = {index: block.packet(index) for index in range(block.count)}
-    assert body(packets, block) == image.tobytes()
+    assert body(packets, block) == image.data.tobytes()
     assert [packet[4] for packet in packets.values()] == [1, *[3] * (block.count - 2), 2]
     assert all(struct.unpack_from(">HH", packet) == (0, 9) for packet in packets.values())
     assert all(len(packet) <= 540 + 8 for packet in packets.values())
@@ -66,11 +68,11 @@ def test_what_is_sent_is_the_block(sender: Sender, receiver: socket.socket) -> N
 
 def test_lost_packets_come_when_asked_for(sender: Sender, receiver: socket.socket) -> None:
     block = Block(1, 0, image_of(120, 160), 600)
-    sender.drop(0.3, seed=4)
+    sender.disturb(Transit(loss=0.3), seed=4)
     sender.send(block, receiver.getsockname())
     packets = received(receiver)
     assert 0 < len(packets) < block.count
-    sender.drop(0.0, seed=0)
+    sender.disturb(Transit(), seed=0)
     for index in set(range(block.count)) - set(packets):
         sender.resend(receiver.getsockname(), 1, index, index)
     packets |= received(receiver)

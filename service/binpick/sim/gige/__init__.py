@@ -1,5 +1,6 @@
-"""Two GigE Vision cameras on the loopback interface: what a client finds, controls, triggers and streams from, in Python."""
+"""GigE Vision cameras on the loopback interface: what a client finds, controls, triggers and streams from, in Python."""
 
-from binpick.sim.gige.pair import GigePair, ImageFn
+from binpick.sim.gige.group import GigeGroup, ImageFn
+from binpick.sim.gige.pair import GigePair
 
-__all__ = ["GigePair", "ImageFn"]
+__all__ = ["GigeGroup", "GigePair", "ImageFn"]

@@ -1,7 +1,6 @@
-"""One simulated camera while it has power: registers, control channel, exposures and stream, on two threads."""
+"""One simulated camera while it has power: registers, control channel, sensor and stream, on two threads."""
 
 import socket
-import struct
 import threading
 import time
 from collections.abc import Callable
@@ -9,21 +8,23 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from binpick.data import Image, Light
-from binpick.sim.gige import gvcp
+from binpick.sim.gige import channel, gvcp, pixels
+from binpick.sim.gige.action import SIGNALS, Action
+from binpick.sim.gige.clock import host_ns
+from binpick.sim.gige.conditions import Conditions
 from binpick.sim.gige.control import Control, Peer
-from binpick.sim.gige.features import LINE_SOURCES, PTP_STATES
-from binpick.sim.gige.gvsp import MAX_BLOCK, Block, Sender
+from binpick.sim.gige.gvcp import Fault, Status
+from binpick.sim.gige.ledger import Ledger
+from binpick.sim.gige.ptp import Ptp
 from binpick.sim.gige.registers import Registers
+from binpick.sim.gige.sensor import Sensor, Shot
+from binpick.sim.gige.stream import Stream
+from binpick.sim.gige.timer import Timer
+from binpick.sim.gige.wiring import Edge, fires
 
 PROJECTOR_LINE = 2
 """Line2, the opto-isolated output, strobes the projector."""
-LINK_BITS_PER_S = 2e9
-"""Twice a GigE camera's wire: fast, and a receiver with 4 MB of socket buffer keeps up."""
-SO_TIMESTAMPNS = 35
-"""The socket option of asm-generic/socket.h, which Python does not name: when did the datagram arrive?"""
 POLL_S = 0.1
-CONTROL_BYTES = 4 << 20
-"""What may wait at the control socket; the kernel clips it to net.core.rmem_max."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,44 +40,45 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
-    """An accepted trigger."""
+class Surroundings:
+    """What a camera has around it. `expose(head, light, shot)` makes the image at the exposure's end, `projector()` says
+    whether the projector strobes, `began(head, shot)` hears of exposures, `reset(head)` of the wish to start anew."""
 
-    number: int
-    started_ns: int
-    light: Light
-
-
-def device_clock_ns() -> int:
-    """The clock that all simulated cameras share, as if by PTP; nanoseconds."""
-    return time.clock_gettime_ns(time.CLOCK_REALTIME)
+    expose: Callable[[int, Light, int], Image]
+    projector: Callable[[], bool]
+    began: Callable[[int, Shot], None]
+    reset: Callable[[int], None]
+    ptp: Ptp
+    timer: Timer
+    ledger: Ledger
 
 
 class Device:
-    """Runs from `start` to `stop`; a camera that gets power again is a new Device.
+    """Runs from `start` to `stop`; a camera that gets power again is a new Device."""
 
-    `expose(light, shot)` makes the image at the end of the exposure. `projector()` says whether the projector strobes.
-    """
-
-    def __init__(self, identity: Identity, expose: Callable[[Light, int], Image], projector: Callable[[], bool]) -> None:
+    def __init__(self, identity: Identity, around: Surroundings, conditions: Conditions) -> None:
         self.identity = identity
-        self.frozen = False
-        self.missed_triggers = 0
-        self._expose = expose
-        self._projector = projector
+        self._around = around
         self.registers = Registers(identity.address, identity.width, identity.height, identity.serial)
-        self._socket = _control_socket(identity.address)
-        self.sender = Sender(identity.address, LINK_BITS_PER_S)
-        self.registers.set("GevSCSP", self.sender.port)
-        self._control = Control(self.registers, self._written, self._resend, self._stop_acquisition)
+        self._socket = channel.control_socket(identity.address)
+        around.ptp.power(identity.index, host_ns())
+        self.conditions = Conditions()
+        self.stream = Stream(identity.index, identity.address, self.registers, around.ledger, self._stamp)
+        index = identity.index
+        self.sensor = Sensor(self.registers, lambda light, shot: around.expose(index, light, shot), around.projector,
+                             self._began, self._deliver)
+        self.control = Control(self.registers, self._written, self.stream.resend, self.sensor.end, self._act)
+        self.meet(conditions)
         self._off = threading.Event()
-        self._state = threading.Condition()
-        self._acquiring = False
-        self._shots = 0
-        self._blocks = 0
-        self._pending: Shot | None = None
         self._threads = [threading.Thread(target=target, name=f"binpick-gige-{identity.name}-{role}", daemon=True)
-                         for role, target in (("control", self._serve), ("exposure", self._run_exposures))]
+                         for role, target in (("control", self._serve), ("exposure", self.sensor.run))]
+
+    def meet(self, conditions: Conditions) -> None:
+        """These hold from now on."""
+        before, self.conditions = self.conditions, conditions
+        self.stream.sender.mtu = conditions.mtu
+        if (before.transit, before.seed) != (conditions.transit, conditions.seed):     # else chance goes on as it was
+            self.stream.sender.disturb(conditions.transit, conditions.seed + self.identity.index)
 
     def start(self) -> None:
         """Power on."""
@@ -89,24 +91,40 @@ class Device:
         with suppress(OSError):        # not connected, but it wakes the thread that waits
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
-        self.sender.close()
-        with self._state:
-            self._state.notify_all()
+        self.stream.sender.close()
+        self.sensor.power_off()
 
     def stop(self, timeout_s: float = 1.0) -> None:
         """Power off, and waits for the threads; one that is making an image longer than that is left to end alone."""
         self.power_off()
         deadline = time.monotonic() + timeout_s
         for thread in self._threads:
-            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
 
-    def strobes(self) -> bool:
-        """Whether this camera's output line fires the projector during exposure."""
-        return self.registers.integer("LineSource", PROJECTOR_LINE) == LINE_SOURCES["ExposureActive"]
+    def strobes(self, line: int = PROJECTOR_LINE) -> bool:
+        """Whether that output line shows the exposure."""
+        return (self.registers.name("LineSource", line) == "ExposureActive"
+                and self.registers.name("LineMode", line) == "Output")
+
+    def feel(self, line: int, edge: Edge) -> None:
+        """An edge arrives at one of its inputs."""
+        read = self.registers
+        if read.name("LineMode", line) == "Input" and read.name("TriggerSource") == f"Line{line}" and fires(
+                edge, bool(read.integer("LineInverter", line)), read.name("TriggerActivation")):
+            self.trigger(edge.at_ns)
+
+    def trigger(self, at_ns: int) -> None:
+        """By whatever cause."""
+        if self.conditions.answers:
+            self.sensor.trigger(at_ns + int(self.conditions.skew_us * 1000))
 
     def receive(self, datagram: bytes, peer: Peer, arrived_ns: int) -> None:
-        """Answers one datagram."""
-        reply = self._control.answer(datagram, peer, arrived_ns)
+        """Answers one datagram, unless its cable is out or it hangs."""
+        if not (self.conditions.plugged and self.conditions.answers):
+            return
+        self._look_at_ptp(arrived_ns)
+        reply = self.control.answer(datagram, peer, arrived_ns)
         if reply is not None:
             with suppress(OSError):    # the peer, or this camera, is gone
                 self._socket.sendto(reply, peer)
@@ -116,120 +134,117 @@ class Device:
         while not self._off.is_set():
             try:
                 self._socket.settimeout(0 if requests else POLL_S)
-                datagram, ancillary, _flags, peer = self._socket.recvmsg(2048, 64)
+                datagram, peer, arrived_ns = channel.receive(self._socket)
             except BlockingIOError:
                 peer, _ = oldest = next(iter(requests))
                 datagram, arrived_ns = requests.pop(oldest)
                 self.receive(datagram, peer, arrived_ns)
                 continue
             except TimeoutError:
-                self._control.expire(device_clock_ns())
+                self._expire()
                 continue
             except OSError:
                 if self._off.is_set():
                     return
                 raise
-            self._control.expire(device_clock_ns())
+            self._expire()
             if gvcp.is_resend(datagram):
-                requests[peer, datagram[gvcp.HEADER.size:]] = datagram, _arrival_ns(ancillary)
+                requests[peer, datagram[gvcp.HEADER.size:]] = datagram, arrived_ns
             elif datagram:
-                self.receive(datagram, peer, _arrival_ns(ancillary))
+                self.receive(datagram, peer, arrived_ns)
+
+    def _expire(self) -> None:
+        if self.conditions.answers:
+            self.control.expire(host_ns())
+
+    def _look_at_ptp(self, now_ns: int) -> None:
+        """Its state is read live; the offset is latched."""
+        state = self._around.ptp.state(self.identity.index, now_ns)
+        self.registers.choose("PtpStatus", state)
+        self.registers.choose("PtpServoStatus", {"Slave": "Locked", "Disabled": "Disabled"}.get(state, "Unknown"))
 
     def _written(self, feature: str, arrived_ns: int) -> None:
+        read = self.registers
         match feature:
             case "AcquisitionStart":
-                self._start_acquisition()
+                self.stream.sender.forget()
+                self.sensor.begin()
             case "AcquisitionStop":
-                self._stop_acquisition()
-            case "TriggerSoftware":
+                self.sensor.end()
+            case "TriggerSoftware" if read.name("TriggerSource") == "Software":
                 self.trigger(arrived_ns)
-            case "GevTimestampControlLatch":
-                self.registers.set("GevTimestampValue", device_clock_ns())
+            case "TriggerMode" | "AcquisitionFrameRate":
+                self.sensor.wake()
+            case "PixelFormat":
+                size = pixels.size(self.identity.width, self.identity.height, read.integer("PixelFormat"))
+                read.set("PayloadSize", size)
+            case "DeviceReset":
+                self._around.reset(self.identity.index)
+            case "GevSCPSPacketSize" if read.integer("GevSCPSFireTestPacket"):
+                read.set("GevSCPSFireTestPacket", 0)
+                self.stream.test()
+            case _:
+                self._timed(feature, arrived_ns)
+
+    def _timed(self, feature: str, arrived_ns: int) -> None:
+        """As `_written`, for what has to do with clocks."""
+        ptp, index, read = self._around.ptp, self.identity.index, self.registers
+        match feature:
+            case "GevTimestampControlLatch" | "TimestampLatch":
+                for latched in ("GevTimestampValue", "TimestampLatchValue"):
+                    read.set(latched, ptp.clock(index, arrived_ns).at(arrived_ns))
+            case "TimestampReset":
+                ptp.reset(index, arrived_ns)
             case "PtpEnable":
-                enabled = self.registers.integer("PtpEnable")
-                master = PTP_STATES["Master"] if self.identity.index == 0 else PTP_STATES["Slave"]
-                self.registers.set("PtpStatus", master if enabled else PTP_STATES["Disabled"])
-            case "GevSCPSPacketSize" if self.registers.integer("GevSCPSFireTestPacket"):
-                self.registers.set("GevSCPSFireTestPacket", 0)
-                with suppress(OSError):      # too large for the interface: exactly what the test is to find out
-                    self.sender.test(self._target(), self.registers.integer("GevSCPSPacketSize"))
+                ptp.enable(index, bool(read.integer("PtpEnable")), arrived_ns)
+            case "PtpDataSetLatch":
+                self._latch_ptp(arrived_ns)
 
-    def _target(self) -> tuple[str, int]:
-        return (socket.inet_ntoa(self.registers.integer("GevSCDA").to_bytes(4, "big")),
-                self.registers.integer("GevSCPHostPort"))
+    def _latch_ptp(self, now_ns: int) -> None:
+        ptp, index = self._around.ptp, self.identity.index
+        leader = ptp.leader(index, now_ns)
+        self.registers.set("PtpOffsetFromMaster", ptp.offset_ns(index, now_ns))
+        self.registers.set("PtpClockID", clock_id(index))
+        self.registers.set("PtpGrandmasterClockID", 0 if leader is None else clock_id(leader))
 
-    def _resend(self, block: int, first: int, last: int) -> None:
-        with suppress(OSError):
-            self.sender.resend(self._target(), block, first, last)
+    def _act(self, action: Action, arrived_ns: int) -> bool:
+        """Raises Fault: without a common time nothing is scheduled; what comes late is done at once, and said."""
+        read, index = self.registers, self.identity.index
+        groups = [(read.integer("ActionGroupKey", n), read.integer("ActionGroupMask", n)) for n in range(SIGNALS)]
+        signals = action.signals(read.integer("ActionDeviceKey"), groups)
+        if not signals:
+            return False
+        at_ns = arrived_ns
+        if action.at_ns is not None:
+            if self._around.ptp.state(index, arrived_ns) not in ("Master", "Slave"):
+                raise Fault(Status.NO_REF_TIME)
+            at_ns = max(arrived_ns, self._around.ptp.clock(index, arrived_ns).when(action.at_ns))
+        if read.name("TriggerSource") in [f"Action{signal}" for signal in signals]:
+            if at_ns > arrived_ns:
+                self._around.timer.call(at_ns, lambda: self.trigger(at_ns))
+            else:
+                self.trigger(at_ns)
+        if action.at_ns is not None and at_ns == arrived_ns:
+            raise Fault(Status.ACTION_LATE)
+        return True
 
-    def _start_acquisition(self) -> None:
-        with self._state:
-            self._acquiring, self._blocks, self._pending = True, 0, None
-        self.sender.forget()
+    def _began(self, shot: Shot) -> None:
+        self._around.began(self.identity.index, shot)
+        self.stream.began(shot, self.conditions)
 
-    def _stop_acquisition(self) -> None:
-        with self._state:
-            self._acquiring, self._pending = False, None
+    def _stamp(self, at_ns: int) -> int:
+        return self._around.ptp.clock(self.identity.index, host_ns()).at(at_ns)
 
-    def trigger(self, arrived_ns: int) -> None:
-        """Starts one exposure, if it is ready for one."""
-        read = self.registers.integer
-        with self._state:
-            ready = self._acquiring and self._pending is None and read("TriggerMode") == 1
-            if not ready:
-                self.missed_triggers += 1
-                return
-            self._shots += 1
-            light = Light(exposure_us=self.registers.number("ExposureTime"), gain_db=self.registers.number("Gain"),
-                          projector=self._projector())
-            self._pending = Shot(self._shots, arrived_ns, light)
-            self._state.notify_all()
-
-    def _run_exposures(self) -> None:
-        while not self._off.is_set():
-            with self._state:
-                self._state.wait_for(lambda: self._off.is_set() or self._pending is not None)
-                shot = self._pending
-            if shot is None:
-                continue
-            ends_ns = shot.started_ns + int(shot.light.exposure_us * 1000)
-            self._off.wait(max(0.0, (ends_ns - device_clock_ns()) / 1e9))
-            with self._state:
-                if self._pending is not shot:      # acquisition ended meanwhile
-                    continue
-                self._pending = None
-                self._blocks = self._blocks % MAX_BLOCK + 1
-                block = self._blocks
-            self._deliver(shot, block)
-
-    def _deliver(self, shot: Shot, block: int) -> None:
-        image = self._expose(shot.light, shot.number)
-        if self.frozen or self._off.is_set() or not self._acquiring:
+    def _deliver(self, shot: Shot, image: Image) -> None:
+        if self._off.is_set():
             return
-        packets = Block(block, shot.started_ns, image, self.registers.integer("GevSCPSPacketSize"))
         try:
-            self.sender.send(packets, self._target())
+            self.stream.deliver(shot, image, self.conditions, self.sensor.acquiring)
         except OSError:
             if not self._off.is_set():
                 raise
 
 
-def _control_socket(address: str) -> socket.socket:
-    control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    control.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    control.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, CONTROL_BYTES)
-    try:
-        control.bind((address, gvcp.PORT))
-    except OSError:
-        control.close()
-        raise
-    return control
-
-
-def _arrival_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
-    """When the kernel got the datagram: an exposure starts then, however late this process looks."""
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
-            seconds, nanoseconds = struct.unpack("@qq", data)
-            return int(seconds * 1_000_000_000 + nanoseconds)
-    return device_clock_ns()
+def clock_id(index: int) -> int:
+    """A head's EUI-64."""
+    return 0x0242_00FF_FE00_0000 + index

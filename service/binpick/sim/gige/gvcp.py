@@ -19,6 +19,7 @@ class Code(IntEnum):
     WRITEREG = 0x0082
     READMEM = 0x0084
     WRITEMEM = 0x0086
+    ACTION = 0x0100
 
 
 class Status(IntEnum):
@@ -30,6 +31,8 @@ class Status(IntEnum):
     WRITE_PROTECT = 0x8004
     BAD_ALIGNMENT = 0x8005
     ACCESS_DENIED = 0x8006
+    NO_REF_TIME = 0x8013
+    ACTION_LATE = 0x8016
 
 
 class Fault(Exception):

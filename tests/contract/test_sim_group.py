@@ -1,0 +1,263 @@
+"""The simulated group as libaravis sees it: clocks, wires, actions, pixel formats, and the truth behind each image."""
+
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gi
+import numpy as np
+import pytest
+
+from binpick.data import Image, Light
+from binpick.sim.gige import GigeGroup
+from binpick.sim.gige.clock import host_ns
+
+gi.require_version("Aravis", "0.8")
+from gi.repository import Aravis  # noqa: E402
+
+pytestmark = pytest.mark.gige
+
+WIDTH, HEIGHT = 320, 200
+KEY, GROUP, MASK = 0xB1D0, 5, 1
+NO_REF_TIME, ACTION_LATE = 0x8013, 0x8016
+SETTLE_S = 0.2
+
+
+def picture(index: int, _light: Light, shot: int) -> Image:
+    return np.random.default_rng(1000 * index + shot).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+
+
+class Head:
+    """A camera and its stream, armed; everything by SFNC names."""
+
+    def __init__(self, address: str, source: str = "Software", pixel_format: str = "Mono8") -> None:
+        self.camera = Aravis.Camera.new(address)
+        for name, value in (("PixelFormat", pixel_format), ("TriggerMode", "On"), ("TriggerSource", source),
+                            ("TriggerActivation", "RisingEdge")):
+            self.camera.set_string(name, value)
+        self.camera.set_float("ExposureTime", 2000.0)
+        self.camera.gv_set_stream_options(Aravis.GvStreamOption.PACKET_SOCKET_DISABLED)
+        self.camera.gv_set_packet_size(8000)
+        self.stream = self.camera.create_stream(None, None)
+        self.stream.set_property("frame-retention", 500_000)
+        for _ in range(6):
+            self.stream.push_buffer(Aravis.Buffer.new_allocate(self.camera.get_payload()))
+        self.camera.start_acquisition()
+
+    def set_line(self, line: str, **values: Any) -> None:
+        self.camera.set_string("LineSelector", line)
+        for name, value in values.items():
+            self.camera.set_string(name, value)
+
+    def action(self, number: int = 0) -> None:
+        self.camera.set_integer("ActionDeviceKey", KEY)
+        self.camera.set_integer("ActionSelector", number)
+        self.camera.set_integer("ActionGroupKey", GROUP)
+        self.camera.set_integer("ActionGroupMask", MASK)
+
+    def now_ns(self) -> int:
+        self.camera.execute_command("TimestampLatch")
+        return int(self.camera.get_integer("TimestampLatchValue"))
+
+    def grab(self, timeout_s: float = 2.0) -> Any:
+        """The next whole image; None when none comes."""
+        buffer = self.stream.timeout_pop_buffer(int(timeout_s * 1e6))
+        if buffer is not None:
+            assert buffer.get_status() == Aravis.BufferStatus.SUCCESS, buffer.get_status()
+        return buffer
+
+
+@pytest.fixture
+def group(gige_addresses: tuple[str, str]) -> Iterator[GigeGroup]:
+    with GigeGroup(picture, gige_addresses, (WIDTH, HEIGHT), settle_s=SETTLE_S) as group:
+        yield group
+
+
+@pytest.fixture
+def heads(group: GigeGroup, gige_addresses: tuple[str, str]) -> Iterator[Callable[..., list[Head]]]:
+    """Makes both, and lets go of them while they can still answer."""
+    made: list[Head] = []
+
+    def make(*sources: str, pixel_format: str = "Mono8") -> list[Head]:
+        for address, source in zip(gige_addresses, sources or ("Software", "Software"), strict=True):
+            made.append(Head(address, source, pixel_format))
+        return made
+
+    yield make
+    made.clear()
+
+
+def until(condition: Callable[[], bool], limit_s: float = 3.0) -> None:
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < limit_s
+        time.sleep(0.01)
+
+
+def synchronise(heads: list[Head]) -> None:
+    for head in heads:
+        head.camera.set_boolean("PtpEnable", True)
+    until(lambda: [head.camera.get_string("PtpStatus") for head in heads] == ["Master", "Slave"])
+
+
+def command(target: str, at_ns: int | None = None, key: int = KEY, mask: int = MASK) -> list[tuple[str, int]]:
+    """Sends an action command and returns who acknowledged it with which status within 0.3 s."""
+    command.number = getattr(command, "number", 0) % 65535 + 1          # type: ignore[attr-defined]
+    keys = struct.pack(">III", key, GROUP, mask) + (b"" if at_ns is None else struct.pack(">Q", at_ns))
+    flags = 0x01 if at_ns is None else 0x81
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        sender.bind(("127.0.0.1", 0))
+        sender.settimeout(0.3)
+        sender.sendto(struct.pack(">BBHHH", 0x42, flags, 0x0100, len(keys), command.number) + keys,   # type: ignore[attr-defined]
+                      (target, 3956))
+        answers = []
+        try:
+            while True:
+                datagram, (address, _port) = sender.recvfrom(100)
+                status, code, _length, _number = struct.unpack(">HHHH", datagram[:8])
+                assert code == 0x0101
+                answers.append((address, status))
+        except TimeoutError:
+            return sorted(answers)
+
+
+def starts(group: GigeGroup) -> list[int]:
+    return [group.truth(index)[-1].started_ns for index in (0, 1)]
+
+
+def test_each_head_has_its_own_clock_until_ptp_joins_them(heads: Callable[..., list[Head]]) -> None:
+    left, right = heads()
+    apart = left.now_ns() - right.now_ns()
+    assert 500e6 < abs(apart) < 1000e6
+    assert [head.camera.get_string("PtpStatus") for head in (left, right)] == ["Disabled", "Disabled"]
+    left.camera.set_boolean("PtpEnable", True)
+    assert left.camera.get_string("PtpStatus") == "Initializing"
+    synchronise([left, right])
+    assert abs(left.now_ns() - right.now_ns()) < 50e6       # as far apart as the two latches are
+    for head in (left, right):
+        head.camera.execute_command("PtpDataSetLatch")
+    assert abs(right.camera.get_integer("PtpOffsetFromMaster")) < 100
+    assert right.camera.get_string("PtpServoStatus") == "Locked"
+    assert right.camera.get_integer("PtpGrandmasterClockID") == left.camera.get_integer("PtpClockID") != 0
+
+
+def test_time_stamps_are_the_heads_own_and_the_truth_is_the_hosts(group: GigeGroup,
+                                                                  heads: Callable[..., list[Head]]) -> None:
+    for index, head in enumerate(heads()):
+        before = host_ns()
+        head.camera.software_trigger()
+        after = host_ns()
+        image = head.grab()
+        [entry] = group.truth(index)
+        assert before <= entry.started_ns <= after
+        assert (image.get_frame_id(), image.get_timestamp()) == (entry.block, entry.timestamp_ns)
+        assert abs(entry.timestamp_ns - entry.started_ns) > 300e6
+        assert image.get_data() == bytes(group.sent(index, entry.block)) == picture(index, entry.light, 1).tobytes()
+
+
+def test_by_wire_the_second_head_exposes_with_the_first(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, right = heads("Software", "Line0")
+    left.set_line("Line1", LineMode="Output", LineSource="ExposureActive")
+    left.camera.software_trigger()
+    assert left.grab() is not None
+    assert right.grab() is not None
+    master, slave = starts(group)
+    assert 19_000 < slave - master < 21_000
+    group.change(1, wired=False)
+    left.camera.software_trigger()
+    assert left.grab() is not None
+    assert right.grab(0.2) is None
+    group.change(1, wired=True, skew_us=150.0)
+    left.camera.software_trigger()
+    assert right.grab() is not None
+    assert left.grab() is not None
+    master, slave = starts(group)
+    assert 169_000 < slave - master < 171_000
+
+
+def test_a_falling_edge_comes_at_the_exposures_end(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, right = heads("Software", "Line0")
+    left.set_line("Line1", LineMode="Output", LineSource="ExposureActive")
+    right.camera.set_string("TriggerActivation", "FallingEdge")
+    left.camera.software_trigger()
+    assert right.grab() is not None
+    master, slave = starts(group)
+    assert 2_019_000 < slave - master < 2_021_000
+
+
+def test_a_broadcast_action_triggers_both(group: GigeGroup, heads: Callable[..., list[Head]],
+                                          gige_addresses: tuple[str, str]) -> None:
+    both = heads("Action0", "Action1")
+    for number, head in enumerate(both):
+        head.action(number)
+    for shots, target in enumerate(("255.255.255.255", "127.255.255.255"), 1):
+        assert command(target) == [(address, 0) for address in gige_addresses]
+        assert [head.grab().get_frame_id() for head in both] == [shots, shots]
+        left, right = starts(group)
+        assert left == right
+    assert command(gige_addresses[0]) == [(gige_addresses[0], 0)]
+    assert both[0].grab() is not None
+    assert command("127.255.255.255", key=KEY + 1) == []
+    assert command("127.255.255.255", mask=MASK << 1) == []
+    assert both[1].grab(0.1) is None
+
+
+def test_a_scheduled_action_needs_a_common_time_and_hits_it(group: GigeGroup, heads: Callable[..., list[Head]],
+                                                            gige_addresses: tuple[str, str]) -> None:
+    both = heads("Action0", "Action0")
+    for head in both:
+        head.action()
+    at_ns = both[0].now_ns() + 50_000_000
+    assert command("127.255.255.255", at_ns) == [(address, NO_REF_TIME) for address in gige_addresses]
+    synchronise(both)
+    at_ns = both[0].now_ns() + 50_000_000
+    assert command("127.255.255.255", at_ns) == [(address, 0) for address in gige_addresses]
+    for index, head in enumerate(both):
+        assert abs(head.grab().get_timestamp() - at_ns) <= 1
+        assert group.truth(index)[-1].timestamp_ns == pytest.approx(at_ns, abs=1)
+    left, right = starts(group)
+    assert 0 < abs(left - right) < 1000                      # PTP's own residue
+    assert command("127.255.255.255", at_ns) == [(address, ACTION_LATE) for address in gige_addresses]
+    assert [head.grab() is None for head in both] == [False, False]
+
+
+def test_a_trigger_during_exposure_is_dropped_and_counted(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, _right = heads()
+    left.camera.set_float("ExposureTime", 200_000.0)
+    for _ in range(3):
+        left.camera.software_trigger()
+    assert left.grab().get_frame_id() == 1
+    assert left.grab(0.3) is None
+    assert (group.missed_triggers(0), len(group.truth(0))) == (2, 1)
+
+
+@pytest.mark.parametrize(("name", "size"), [("Mono10", 2.0), ("Mono10p", 1.25), ("Mono12", 2.0), ("Mono12p", 1.5),
+                                            ("Mono12Packed", 1.5), ("BayerRG8", 1.0)])
+def test_pixel_formats(group: GigeGroup, heads: Callable[..., list[Head]], name: str, size: float) -> None:
+    left, _right = heads(pixel_format=name)
+    left.camera.software_trigger()
+    image = left.grab()
+    assert left.camera.get_payload() == WIDTH * HEIGHT * size == len(image.get_data())
+    assert image.get_image_pixel_format() == getattr(Aravis, {
+        "Mono10": "PIXEL_FORMAT_MONO_10", "Mono12": "PIXEL_FORMAT_MONO_12", "Mono12Packed": "PIXEL_FORMAT_MONO_12_PACKED",
+        "BayerRG8": "PIXEL_FORMAT_BAYER_RG_8"}.get(name, ""), group.truth(0)[-1].format)
+    assert image.get_data() == bytes(group.sent(0, 1))
+
+
+def test_auto_exposure_finds_its_grey(group: GigeGroup, gige_addresses: tuple[str, str]) -> None:
+    def grey(_index: int, light: Light, _shot: int) -> Image:
+        return np.full((HEIGHT, WIDTH), min(255, round(light.exposure_us / 80)), np.uint8)
+
+    group.stop()
+    with GigeGroup(grey, gige_addresses, (WIDTH, HEIGHT)):
+        head = Head(gige_addresses[0])
+        head.camera.set_string("ExposureAuto", "Once")
+        for _ in range(4):
+            head.camera.software_trigger()
+            head.grab()
+        assert head.camera.get_string("ExposureAuto") == "Off"
+        assert head.camera.get_float("ExposureTime") == pytest.approx(8000, rel=0.05)
+        del head
