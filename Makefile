@@ -27,6 +27,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 install-test: $(STAMP)
 	@deploy/install-packages $(TEST_SYSTEM)
+	@deploy/install-conformance $(BIN)
 
 lint: $(STAMP)
 	$(BIN)/ruff check service calib tests

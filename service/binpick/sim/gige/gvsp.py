@@ -29,7 +29,7 @@ BURST_BYTES = 60_000
 MAX_SEGMENTS = 60
 """The kernel cuts a datagram into at most 64."""
 BURST_S = 0.0005
-"""What leaves at once when there are to be gaps."""
+"""What may leave at once: a slow link's packets come one by one."""
 Target = tuple[str, int]
 
 
@@ -137,10 +137,8 @@ class Sender:
     def _send(self, block: Block, order: Indices, target: Target) -> None:
         """Runs of whole payload packets as bursts, all others one by one."""
         start, size = time.monotonic(), block.rows.shape[1]
-        segments = self._segments(size)
         per_packet_s = size * 8 / self.bits_per_s + self.gap_ns / 1e9
-        if self.gap_ns:
-            segments = max(1, min(segments, int(BURST_S / per_packet_s)))
+        segments = max(1, min(self._segments(size), int(BURST_S / per_packet_s)))
         gone = 0
         whole = (order > 0) & (order <= len(block.rows))
         for run in np.split(order, np.flatnonzero(np.diff(whole)) + 1):
