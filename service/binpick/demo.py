@@ -29,7 +29,7 @@ from binpick.errors import Code, NotReady, PortInUse
 from binpick.geometry import Transform
 from binpick.poses import PoseFormat, encode
 from binpick.sim import exam, score
-from binpick.sim.gige import GigePair, gvcp
+from binpick.sim.gige import Door, GigePair, gvcp
 from binpick.sim.plc import Plc, PlcResult
 from binpick.sim.score import Verdict
 from binpick.sim.twin import Twin
@@ -157,7 +157,7 @@ def _waiting(say: Console, what: str) -> Iterator[Status]:
 
 async def _play(plan: Plan, twin: Twin, headless: bool, say: Console) -> int:
     _cancel_on_signals(say)
-    with tempfile.TemporaryDirectory(prefix="binpick-demo-") as folder, GigePair(twin.image, plan.cameras):
+    with tempfile.TemporaryDirectory(prefix="binpick-demo-") as folder, GigePair(twin.image, plan.cameras) as pair, Door(pair):
         cell = files(plan, Path(folder))
         say.print(f"cameras     {plan.cameras[0]} and {plan.cameras[1]} (GigE Vision, simulated)")
         with _daemon(Path(folder)) as alive:

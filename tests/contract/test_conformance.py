@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 LINK_MBPS = 900.0
 """A real camera's wire: the tool leaves its socket at the kernel's small default, which a faster one overruns."""
 SIZE = (400, 252)
-"""Such an image fits that socket whole, so that a busy machine, where the tool waits for a core, is not blamed on the cameras."""
+"""Such an image fits that socket whole, so that a busy machine, where the tool waits for a core, does not lose packets."""
 COLOUR = re.compile(r"\x1b\[[\d;]*m")
 SECTIONS = {"Genicam", "Properties", "MultipleAcquisitionA", "SingleAcquisition", "SoftwareTrigger", "MultipleAcquisitionB",
             "Multipart", "Chunks", "GigEVision"}

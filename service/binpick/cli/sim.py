@@ -1,5 +1,6 @@
-"""`binpick sim`: the simulated cameras alone, for a daemon, or any GigE Vision client, of your own."""
+"""`binpick sim`: the simulated cameras alone, for a daemon, or any GigE Vision client, of your own; and what befalls them."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -7,30 +8,65 @@ import typer
 
 
 def sim(
-    out: Annotated[Path, typer.Option(help="Folder for the cell.yaml and rig.json that fit these cameras.")],
+    out: Annotated[Path | None, typer.Option(help="Run cameras; folder for the cell.yaml and rig.json that fit them.")] = None,
     world: Annotated[str, typer.Option(help="Exam world A or B.")] = "A",
     seed: Annotated[int, typer.Option(help="How the parts fall.", min=0)] = 4,
+    heads: Annotated[int, typer.Option(help="How many cameras, from 127.0.0.2 on.", min=2, max=5)] = 2,
+    numbered: Annotated[bool, typer.Option("--numbered", help="No bin: images that carry camera and number in their pixels.")] = False,
+    fault: Annotated[list[str] | None, typer.Option(
+        metavar="NAME[=VALUE][@CAMERA]", help="What befalls a camera (left, right, third ...) or all; more than once. "
+        "`--fault help` lists them.")] = None,
+    at: Annotated[str, typer.Option(help="Without --out: the simulator whose first camera has this address.")] = "127.0.0.2",
 ) -> None:
-    """Run two GigE Vision cameras on 127.0.0.2 and 127.0.0.3, looking into a bin of settled parts, until Ctrl-C.
+    """Run GigE Vision cameras on 127.0.0.2 and up, looking into a bin of settled parts, until Ctrl-C.
 
     Then, in another terminal: binpick run --cell OUT/cell.yaml
+
+    Without --out: tell the simulator (or demo) that runs already what befalls its cameras, such as
+    binpick sim --fault loss=0.05@left, and print how they are.
     """
+    from binpick.sim.gige import door, faults
+
+    wanted = fault or []
+    if "help" in wanted:
+        typer.echo(faults.manual())
+        return
+    if out is not None:
+        _run(out, world, seed, heads, numbered, wanted)
+        return
+    states = door.ask(at)
+    for text in wanted:
+        states = door.ask(at, text)
+    for state in states:
+        typer.echo(json.dumps(state))
+
+
+def _run(out: Path, world: str, seed: int, heads: int, numbered: bool, wanted: list[str]) -> None:
     import threading
 
     from binpick import demo
     from binpick.errors import InputError
-    from binpick.sim.gige import GigePair
+    from binpick.sim.gige import Door, GigeGroup, faults
+    from binpick.sim.gige.group import ImageFn
+    from binpick.sim.gige.numbered import Numbered
     from binpick.sim.twin import Twin
 
+    parsed = [faults.parse(text, heads) for text in wanted]
     plan = demo.Plan(world=world, seed=seed)
     try:
         out.mkdir(parents=True, exist_ok=True)
         demo.files(plan, out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    typer.echo("Letting the parts settle ...", err=True)
-    with GigePair(Twin(world, demo.KINDS, plan.parts, seed).image, plan.cameras):
-        typer.echo(f"cameras at {plan.cameras[0]} and {plan.cameras[1]}; run: binpick run --cell {out / 'cell.yaml'}")
+    eyes: list[ImageFn] = [Numbered(heads)] * heads
+    if not numbered:
+        typer.echo("Letting the parts settle ...", err=True)
+        eyes[:2] = [Twin(world, demo.KINDS, plan.parts, seed).image] * 2      # the rig that looks into the bin has two
+    addresses = [f"127.0.0.{number}" for number in range(2, 2 + heads)]
+    with GigeGroup(lambda index, light, shot: eyes[index](index, light, shot), addresses) as group, Door(group):
+        for known in parsed:
+            faults.apply(group, known)
+        typer.echo(f"cameras at {', '.join(addresses)}; run: binpick run --cell {out / 'cell.yaml'}")
         try:
             threading.Event().wait()
         except KeyboardInterrupt:

@@ -29,7 +29,7 @@ class Control:
         self._released = released
         self._act = act
         self._controller: Peer | None = None
-        self._stolen = False
+        self.stolen = False
         self._lock = threading.RLock()       # one camera hears on several sockets
         self._heard_ns = 0
         self._last: tuple[bytes, Peer, bytes] = (b"", ("", 0), b"")
@@ -63,13 +63,13 @@ class Control:
         """Frees the camera of a controller that has been silent for longer than the heartbeat timeout."""
         limit_ns = self._registers.integer("GevHeartbeatTimeout") * 1_000_000
         with self._lock:
-            if self._controller and not self._stolen and now_ns - self._heard_ns > limit_ns:
+            if self._controller and not self.stolen and now_ns - self._heard_ns > limit_ns:
                 self._release()
 
     def steal(self, thief: Peer | None) -> None:
         """Another program has control from now on and never falls silent; None: it lets go."""
         with self._lock:
-            self._stolen = thief is not None
+            self.stolen = thief is not None
             self._release()
             if thief is not None:
                 self._controller = thief

@@ -150,6 +150,10 @@ class GigeGroup:
         """Another program takes control of it, as it may after a missed heartbeat, and keeps it until it is told to let go."""
         self._devices[index].control.steal(THIEF if on else None)
 
+    def stolen(self, index: int) -> bool:
+        """Whether another program has it that way."""
+        return self._devices[index].control.stolen
+
     def drop_packets(self, fraction: float, seed: int, resends: bool = True) -> None:
         """All lose that share of their stream packets from now on, resent ones included, or send none again; 0 ends it."""
         for index in self.heads:

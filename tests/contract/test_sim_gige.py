@@ -1,8 +1,9 @@
-"""The simulated group as libaravis sees it: clocks, wires, actions, pixel formats, and the truth behind each image."""
+"""The simulated group as libaravis sees it: clocks, wires, actions, pixel formats, faults, and the truth behind each image."""
 
 import socket
 import struct
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 
 from binpick.data import Image, Light
-from binpick.sim.gige import GigeGroup
+from binpick.errors import InputError, PortInUse
+from binpick.sim.gige import Door, GigeGroup, door, faults, numbered
 from binpick.sim.gige.clock import host_ns
+from binpick.sim.gige.numbered import Numbered
 
 gi.require_version("Aravis", "0.8")
-from gi.repository import Aravis  # noqa: E402
+from gi.repository import Aravis, GLib  # noqa: E402
 
 pytestmark = pytest.mark.gige
 
@@ -23,6 +26,7 @@ WIDTH, HEIGHT = 320, 200
 KEY, GROUP, MASK = 0xB1D0, 5, 1
 NO_REF_TIME, ACTION_LATE = 0x8013, 0x8016
 SETTLE_S = 0.2
+LIGHT = Light(2000.0, 0.0, False)
 
 
 def picture(index: int, _light: Light, shot: int) -> Image:
@@ -261,3 +265,192 @@ def test_auto_exposure_finds_its_grey(group: GigeGroup, gige_addresses: tuple[st
         assert head.camera.get_string("ExposureAuto") == "Off"
         assert head.camera.get_float("ExposureTime") == pytest.approx(8000, rel=0.05)
         del head
+
+
+def alive(address: str) -> bool:
+    """Whether it answers a discovery."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(0.2)
+        client.connect((address, 3956))
+        try:
+            client.send(bytes.fromhex("4201000200000001"))
+            return len(client.recv(1000)) == 256
+        except OSError:
+            return False
+
+
+def do(group: GigeGroup, *words: str) -> None:
+    for text in words:
+        faults.apply(group, faults.parse(text))
+
+
+def shoot(head: Head) -> Any:
+    head.camera.software_trigger()
+    return head.grab()
+
+
+@pytest.mark.parametrize("fault", ["loss=0.2", "duplicate=0.3", "reorder=0.5", "late=0.1", "early_leader"])
+def test_a_bad_way_costs_no_pixel(group: GigeGroup, heads: Callable[..., list[Head]], fault: str) -> None:
+    left, _right = heads()
+    left.stream.set_property("packet-request-ratio", 1.0)
+    left.camera.set_float("ExposureTime", 20_000.0)
+    do(group, f"{fault}@left")
+    for shot in range(1, 6):
+        assert shoot(left).get_data() == picture(0, LIGHT, shot).tobytes()
+    assert group.resent(0) > 0 or not fault.startswith("loss")
+
+
+def test_without_resends_what_is_lost_stays_lost(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, right = heads()
+    do(group, "loss=0.3", "resends=off")
+    left.camera.software_trigger()
+    buffer = left.stream.timeout_pop_buffer(2_000_000)
+    assert buffer is None or buffer.get_status() != Aravis.BufferStatus.SUCCESS
+    do(group, "clear")
+    assert shoot(right).get_data() == bytes(group.sent(1, 1))
+
+
+def test_packets_beyond_the_mtu_do_not_get_through(group: GigeGroup, gige_addresses: tuple[str, str]) -> None:
+    do(group, "mtu=1500@left")
+    for address, limit in zip(gige_addresses, (1500, 16_000), strict=True):
+        camera = Aravis.Camera.new(address)
+        camera.gv_set_stream_options(Aravis.GvStreamOption.PACKET_SOCKET_DISABLED)
+        assert limit - 8 <= camera.gv_auto_packet_size() <= limit
+        del camera
+
+
+def test_a_slow_link_and_a_gap_between_packets_take_their_time(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, _right = heads()
+
+    def took_s() -> float:
+        start = time.monotonic()
+        assert shoot(left) is not None
+        return time.monotonic() - start
+
+    bits, packets = 8 * WIDTH * HEIGHT, WIDTH * HEIGHT / 7964
+    do(group, "link=4")
+    assert took_s() > bits / 4e6 * 0.9
+    do(group, "link=1000")
+    left.camera.gv_set_packet_delay(10_000_000)
+    assert took_s() > (packets - 1) * 0.01
+    left.camera.gv_set_packet_delay(0)
+    left.camera.set_integer("DeviceLinkThroughputLimit", 32_375_000)
+    assert took_s() > bits / 8 / 32_375_000
+
+
+def test_another_pixel_format_than_it_was_told(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, _right = heads()
+    do(group, "pixel_format=BayerRG8@left")
+    assert shoot(left).get_image_pixel_format() == Aravis.PIXEL_FORMAT_BAYER_RG_8
+    assert left.camera.get_string("PixelFormat") == "Mono8"
+    do(group, "pixel_format=off@left")
+    assert shoot(left).get_image_pixel_format() == Aravis.PIXEL_FORMAT_MONO_8
+
+
+def test_a_head_that_hangs_is_silent_and_goes_on(group: GigeGroup, heads: Callable[..., list[Head]],
+                                                 gige_addresses: tuple[str, str]) -> None:
+    left, right = heads("Software", "Line0")
+    left.set_line("Line1", LineMode="Output", LineSource="ExposureActive")
+    do(group, "freeze@right")
+    assert [alive(address) for address in gige_addresses] == [True, False]
+    assert shoot(left) is not None
+    assert right.grab(0.1) is None
+    assert group.truth(1) == ()
+    do(group, "freeze=off@right", "unplug@right")
+    assert not alive(gige_addresses[1])
+    assert shoot(left) is not None
+    assert right.grab(0.1) is None
+    assert [entry.sent for entry in group.truth(1)] == [False]         # exposed, by wire
+    do(group, "unplug=off@right", "mute@right")
+    assert alive(gige_addresses[1])
+    assert shoot(left) is not None
+    assert right.grab(0.1) is None
+    do(group, "mute=off")
+    assert shoot(left) is not None
+    assert right.grab().get_frame_id() == 3
+
+
+def test_device_reset_loses_what_was_set(group: GigeGroup, heads: Callable[..., list[Head]],
+                                         gige_addresses: tuple[str, str]) -> None:
+    left, _right = heads()
+    left.camera.set_float("ExposureTime", 1234.0)
+    left.camera.set_boolean("PtpEnable", True)
+    left.camera.execute_command("DeviceReset")
+    until(lambda: not alive(gige_addresses[0]))
+    until(lambda: alive(gige_addresses[0]))
+    assert left.camera.get_string("PtpStatus") == "Disabled"
+    with pytest.raises(GLib.Error, match="access-denied"):
+        left.camera.set_float("ExposureTime", 1234.0)
+    do(group, "reboot=0.1@right", "power=off@left")
+    until(lambda: not alive(gige_addresses[1]))
+    until(lambda: alive(gige_addresses[1]))
+    assert not alive(gige_addresses[0])
+    with pytest.raises(InputError, match="left has no power"):
+        do(group, "misfire@left")
+    do(group, "power=on@left")
+    assert alive(gige_addresses[0])
+
+
+def test_a_stolen_head_refuses_its_former_controller(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
+    left, right = heads()
+    do(group, "stolen@left")
+    with pytest.raises(GLib.Error, match="access-denied"):
+        left.camera.software_trigger()
+    assert left.camera.get_string("TriggerMode") == "On"                # who may not write may read
+    assert shoot(right) is not None
+    do(group, "stolen=off@left")
+
+
+@pytest.mark.parametrize("state", ["Faulty", "Listening"])
+def test_ptp_falls_back(group: GigeGroup, heads: Callable[..., list[Head]], state: str) -> None:
+    both = heads()
+    synchronise(both)
+    do(group, f"ptp={state}@right")
+    assert [head.camera.get_string("PtpStatus") for head in both] == ["Master", state]
+    do(group, "ptp=off", "apart")
+    until(lambda: [head.camera.get_string("PtpStatus") for head in both] == ["Master", "Master"])
+    do(group, "apart=off")
+    synchronise(both)
+
+
+def test_five_heads_by_one_wire(gige_addresses: tuple[str, str]) -> None:
+    net = gige_addresses[0].rsplit(".", 1)[0]
+    addresses = [f"{net}.{number}" for number in range(2, 7)]
+    with GigeGroup(Numbered(5, (WIDTH, HEIGHT)), addresses, (WIDTH, HEIGHT)) as group:
+        made = [Head(address, "Line0" if index else "Software") for index, address in enumerate(addresses)]
+        assert [identity.name for identity in group.identities] == ["left", "right", "third", "fourth", "fifth"]
+        made[0].set_line("Line1", LineMode="Output", LineSource="ExposureActive")
+        for shot in (1, 2, 3):
+            made[0].camera.software_trigger()
+            for index, head in enumerate(made):
+                image = np.frombuffer(head.grab().get_data(), np.uint8).reshape(HEIGHT, WIDTH)
+                assert numbered.read(image) == (index, shot)
+        begun = [group.truth(index)[-1].started_ns for index in group.heads]
+        assert max(begun[1:]) - min(begun[1:]) <= 1000
+        del head, made
+
+
+def test_the_door_breaks_and_tells(group: GigeGroup, heads: Callable[..., list[Head]],
+                                   gige_addresses: tuple[str, str]) -> None:
+    left, _right = heads()
+    address = gige_addresses[0]
+    with pytest.raises(InputError, match=f"no simulator answers at {address}:3957"):
+        door.ask(address)
+    with Door(group):
+        assert shoot(left) is not None
+        first, second = door.ask(address, "ptp=Faulty@right")
+        assert (first["name"], first["images"], first["last"]["block"]) == ("left", 1, 1)
+        assert first["last"]["crc32"] == zlib.crc32(picture(0, LIGHT, 1).tobytes())
+        assert (second["images"], second["ptp"]) == (0, "Disabled")
+        for wrong, says in (("rust", "no fault 'rust': there are loss, "), ("loss=2", "loss takes SHARE"),
+                            ("loss=0.1@third", "no camera 'third': there are left, right"), ("ptp=Sleepy", "one of Init")):
+            with pytest.raises(InputError, match=says):
+                door.ask(address, wrong)
+        with pytest.raises(PortInUse, match="3957"), Door(group):
+            pass
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.settimeout(1)
+            client.sendto(b"[not json", (address, door.PORT))
+            assert b'"error"' in client.recv(1000)
+        assert door.ask(address, "power=off@left")[0]["powered"] is False
+        assert door.ask(address, "clear")[0]["powered"] is True
