@@ -76,6 +76,20 @@ def test_heads_that_do_not_hear_each_other_are_all_masters() -> None:
     assert network.states(2001) == ["Master", "Slave", "Slave"]
 
 
+def test_a_head_that_nobody_hears_for_a_while() -> None:
+    network = Network()
+    network.enable(0, 0, 1, 2)
+    assert network.states(2000) == ["Master", "Slave", "Slave"]
+    network.ptp.cut(0, True, network.zero + 2000 * MS)
+    assert network.states(2001) == ["Initializing", "Master", "Slave"]
+    assert network.states(4000) == ["Master", "Master", "Slave"]
+    assert network.offsets_ns(4000)[2] - network.offsets_ns(4000)[1] == 2 * RESIDUAL_NS
+    network.ptp.cut(0, False, network.zero + 4000 * MS)
+    assert network.states(4300) == ["Listening", "Master", "Slave"]
+    assert network.states(4800) == ["Master", "Uncalibrated", "Uncalibrated"]
+    assert network.states(6000) == ["Master", "Slave", "Slave"]
+
+
 @pytest.mark.parametrize("state", ["Faulty", "Listening"])
 def test_a_head_that_falls_back_and_comes_again(state: str) -> None:
     network = Network()

@@ -70,6 +70,7 @@ class Device:
         self.control = Control(self.registers, self._written, self.stream.resend, self.sensor.end, self._act)
         self.meet(conditions)
         self._off = threading.Event()
+        self._resets = False
         self._threads = [threading.Thread(target=target, name=f"binpick-gige-{identity.name}-{role}", daemon=True)
                          for role, target in (("control", self._serve), ("exposure", self.sensor.run))]
 
@@ -116,7 +117,7 @@ class Device:
 
     def trigger(self, at_ns: int) -> None:
         """By whatever cause."""
-        if self.conditions.answers:
+        if self.conditions.answers and not self._off.is_set():
             self.sensor.trigger(at_ns + int(self.conditions.skew_us * 1000))
 
     def receive(self, datagram: bytes, peer: Peer, arrived_ns: int) -> None:
@@ -128,6 +129,9 @@ class Device:
         if reply is not None:
             with suppress(OSError):    # the peer, or this camera, is gone
                 self._socket.sendto(reply, peer)
+        if self._resets:               # not before its acknowledge has left
+            self._resets = False
+            self._around.reset(self.identity.index)
 
     def _serve(self) -> None:
         requests: dict[tuple[Peer, bytes], tuple[bytes, int]] = {}       # by what they ask for: repeated, one counts once
@@ -179,7 +183,7 @@ class Device:
                 size = pixels.size(self.identity.width, self.identity.height, read.integer("PixelFormat"))
                 read.set("PayloadSize", size)
             case "DeviceReset":
-                self._around.reset(self.identity.index)
+                self._resets = True
             case "GevSCPSPacketSize" if read.integer("GevSCPSFireTestPacket"):
                 read.set("GevSCPSFireTestPacket", 0)
                 self.stream.test()

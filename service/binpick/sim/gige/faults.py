@@ -44,6 +44,18 @@ def _amount(text: str) -> float:
     return amount
 
 
+def _rate(text: str) -> float:
+    if not (rate := _amount(text)):
+        raise ValueError("more than 0")
+    return rate
+
+
+def _count(text: str) -> int:
+    if (count := int(text)) < 0:
+        raise ValueError("not negative")
+    return count
+
+
 def _switch(text: str) -> bool:
     if text not in ("", "on", "off"):
         raise ValueError("on or off")
@@ -87,11 +99,12 @@ FAULTS = {
     "loss": Sort(_share, _transit("loss"), "SHARE of the image packets is lost, 0 to 1"),
     "duplicate": Sort(_share, _transit("duplicate"), "SHARE of the packets comes twice"),
     "reorder": Sort(_share, _transit("reorder"), "SHARE of the packets is overtaken by up to eight others"),
-    "late": Sort(_share, _transit("late"), "SHARE of the packets comes 10 ms after its image's end"),
+    "late": Sort(_share, _transit("late"), "SHARE of the packets comes after its image's end"),
+    "late_ms": Sort(_amount, _transit("late_ms"), "MILLISECONDS after it, 10 at first"),
     "resends": Sort(_switch, _transit("resends"), "off: no packet is sent again"),
-    "seed": Sort(int, _condition("seed"), "NUMBER from which chance begins anew"),
-    "link": Sort(_amount, _condition("link_mbps"), "MBIT/S that the wire carries"),
-    "mtu": Sort(int, _condition("mtu"), "BYTES of the largest packet that gets through"),
+    "seed": Sort(_count, _condition("seed"), "NUMBER from which chance begins anew"),
+    "link": Sort(_rate, _condition("link_mbps"), "MBIT/S that the wire carries"),
+    "mtu": Sort(_count, _condition("mtu"), "BYTES of the largest packet that gets through"),
     "skew": Sort(_amount, _condition("skew_us"), "MICROSECONDS that it exposes later than triggered"),
     "early_leader": Sort(_switch, _condition("early_leader"), "images are announced when their exposure begins"),
     "pixel_format": Sort(_one_of(FORMATS), _condition("pixel_format"), "NAME of the format that it sends, whatever it is told"),

@@ -111,7 +111,7 @@ class GigeGroup:
         self.kill(index)
         identity = self.identities[index]
         with self._lock:
-            self._conditions[index] = self._conditions[index].rebooted()
+            self._meet(index, self._conditions[index].rebooted())
             try:
                 device = self._devices[index] = Device(identity, self._around, self._conditions[index])
             except OSError as error:
@@ -163,9 +163,13 @@ class GigeGroup:
     def change(self, index: int, **changes: object) -> None:
         """Other conditions (fields of Conditions) for one head, from now on."""
         with self._lock:
-            conditions = self._conditions[index] = replace(self._conditions[index], **changes)  # type: ignore[arg-type]
-            if index in self._devices:
-                self._devices[index].meet(conditions)
+            self._meet(index, replace(self._conditions[index], **changes))      # type: ignore[arg-type]
+
+    def _meet(self, index: int, conditions: Conditions) -> None:
+        self._conditions[index] = conditions
+        self.ptp.cut(index, not (conditions.plugged and conditions.answers), host_ns())
+        if index in self._devices:
+            self._devices[index].meet(conditions)
 
     def conditions(self, index: int) -> Conditions:
         """What besets it now."""

@@ -38,6 +38,7 @@ class Port:
     segment: int = 0
     residual_ns: int = 0
     leader: int | None = None
+    cut: bool = False
 
 
 class Ptp:
@@ -80,6 +81,13 @@ class Ptp:
     def move(self, index: int, segment: int, now_ns: int) -> None:
         """To another network; heads of one number hear each other."""
         self._change(index, now_ns, segment=segment)
+
+    def cut(self, index: int, on: bool, now_ns: int) -> None:
+        """Nothing goes in or out of it for a while; when it is heard again, it begins anew."""
+        with self._lock:
+            port = self._ports[index]
+        if port.cut != on:
+            self._change(index, now_ns, cut=on, since_ns=None if port.since_ns is None else now_ns)
 
     def stray(self, index: int, residual_ns: int, now_ns: int) -> None:
         """As a follower it is off by that much, and believes it is not."""
@@ -125,7 +133,7 @@ class Ptp:
     def _update(self, now_ns: int) -> None:
         """Those that begin or cease to follow get the clock that this means."""
         for index, port in enumerate(self._ports):
-            leader = self._master(port.segment, now_ns) if self._state(index, now_ns) == "Slave" else None
+            leader = self._master(index, now_ns) if self._state(index, now_ns) == "Slave" else None
             if leader == port.leader:
                 continue
             own = port.own
@@ -137,11 +145,13 @@ class Ptp:
         port = self._ports[index]
         return port.own if port.leader is None else self._ports[port.leader].own.shifted(port.residual_ns)
 
-    def _master(self, segment: int, now_ns: int) -> int | None:
-        """The first head there that has listened long enough."""
+    def _master(self, listener: int, now_ns: int) -> int | None:
+        """The first head that it hears, or is, and that has listened long enough."""
+        own = self._ports[listener]
         for index, port in enumerate(self._ports):
             ripe = port.since_ns is not None and now_ns - port.since_ns >= self._settle_ns // 2
-            if ripe and not port.forced and port.segment == segment:
+            heard = port.segment == own.segment and not port.cut and not own.cut
+            if ripe and not port.forced and (heard or index == listener):
                 return index
         return None
 
@@ -156,7 +166,7 @@ class Ptp:
             return "Initializing"
         if elapsed < self._settle_ns // 2:
             return "Listening"
-        master = self._master(port.segment, now_ns)
+        master = self._master(index, now_ns)
         if master == index:
             return "Master"
         led_ns = 0 if master is None else now_ns - (self._ports[master].since_ns or 0)
