@@ -84,8 +84,9 @@ def free_port() -> int:
 
 @pytest.fixture
 def gige_addresses() -> tuple[str, str]:
-    """Two loopback addresses whose GigE Vision port, which is fixed, was free a moment ago."""
-    for number in range(20, 250):
+    """Two loopback addresses whose GigE Vision port, which is fixed, was free a moment ago; each run begins elsewhere to look,
+    so that two at once seldom meet."""
+    for number in (20 + (os.getpid() + further) % 230 for further in range(230)):
         addresses = (f"127.0.{number}.2", f"127.0.{number}.3")
         with contextlib.ExitStack() as probes:
             try:

@@ -1,5 +1,6 @@
 """The simulated group as libaravis sees it: clocks, wires, actions, pixel formats, faults, and the truth behind each image."""
 
+import contextlib
 import socket
 import struct
 import time
@@ -65,7 +66,7 @@ class Head:
         self.camera.execute_command("TimestampLatch")
         return int(self.camera.get_integer("TimestampLatchValue"))
 
-    def grab(self, timeout_s: float = 2.0) -> Any:
+    def grab(self, timeout_s: float = 5.0) -> Any:
         """The next whole image; None when none comes."""
         buffer = self.stream.timeout_pop_buffer(int(timeout_s * 1e6))
         if buffer is not None:
@@ -93,7 +94,7 @@ def heads(group: GigeGroup, gige_addresses: tuple[str, str]) -> Iterator[Callabl
     made.clear()
 
 
-def until(condition: Callable[[], bool], limit_s: float = 3.0) -> None:
+def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
     start = time.monotonic()
     while not condition():
         assert time.monotonic() - start < limit_s
@@ -106,26 +107,23 @@ def synchronise(heads: list[Head]) -> None:
     until(lambda: [head.camera.get_string("PtpStatus") for head in heads] == ["Master", "Slave"])
 
 
-def command(target: str, at_ns: int | None = None, key: int = KEY, mask: int = MASK) -> list[tuple[str, int]]:
-    """Sends an action command and returns who acknowledged it with which status within 0.3 s."""
-    command.number = getattr(command, "number", 0) % 65535 + 1          # type: ignore[attr-defined]
+def command(target: str, answers: int, at_ns: int | None = None, key: int = KEY, mask: int = MASK) -> list[tuple[str, int]]:
+    """Sends an action command and returns who acknowledged it with which status; `answers` is how many should."""
+    number = time.monotonic_ns() % 65535 + 1
     keys = struct.pack(">III", key, GROUP, mask) + (b"" if at_ns is None else struct.pack(">Q", at_ns))
     flags = 0x01 if at_ns is None else 0x81
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    came: list[tuple[str, int]] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, contextlib.suppress(TimeoutError):
         sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         sender.bind(("127.0.0.1", 0))
-        sender.settimeout(0.3)
-        sender.sendto(struct.pack(">BBHHH", 0x42, flags, 0x0100, len(keys), command.number) + keys,   # type: ignore[attr-defined]
-                      (target, 3956))
-        answers = []
-        try:
-            while True:
-                datagram, (address, _port) = sender.recvfrom(100)
-                status, code, _length, _number = struct.unpack(">HHHH", datagram[:8])
-                assert code == 0x0101
-                answers.append((address, status))
-        except TimeoutError:
-            return sorted(answers)
+        sender.settimeout(3.0 if answers else 0.2)
+        sender.sendto(struct.pack(">BBHHH", 0x42, flags, 0x0100, len(keys), number) + keys, (target, 3956))
+        while not answers or len(came) < answers:
+            datagram, (address, _port) = sender.recvfrom(100)
+            status, code, _length, answered = struct.unpack(">HHHH", datagram[:8])
+            assert (code, answered) == (0x0101, number)
+            came.append((address, status))
+    return sorted(came)
 
 
 def starts(group: GigeGroup) -> list[int]:
@@ -138,9 +136,10 @@ def test_each_head_has_its_own_clock_until_ptp_joins_them(heads: Callable[..., l
     assert 500e6 < abs(apart) < 1000e6
     assert [head.camera.get_string("PtpStatus") for head in (left, right)] == ["Disabled", "Disabled"]
     left.camera.set_boolean("PtpEnable", True)
-    assert left.camera.get_string("PtpStatus") == "Initializing"
+    assert left.camera.get_string("PtpStatus") != "Disabled"
     synchronise([left, right])
-    assert abs(left.now_ns() - right.now_ns()) < 50e6       # as far apart as the two latches are
+    before = left.now_ns()
+    assert before < right.now_ns() < left.now_ns()
     for head in (left, right):
         head.camera.execute_command("PtpDataSetLatch")
     assert abs(right.camera.get_integer("PtpOffsetFromMaster")) < 100
@@ -199,14 +198,14 @@ def test_a_broadcast_action_triggers_both(group: GigeGroup, heads: Callable[...,
     for number, head in enumerate(both):
         head.action(number)
     for shots, target in enumerate(("255.255.255.255", "127.255.255.255"), 1):
-        assert command(target) == [(address, 0) for address in gige_addresses]
+        assert command(target, 2) == [(address, 0) for address in gige_addresses]
         assert [head.grab().get_frame_id() for head in both] == [shots, shots]
         left, right = starts(group)
         assert left == right
-    assert command(gige_addresses[0]) == [(gige_addresses[0], 0)]
+    assert command(gige_addresses[0], 1) == [(gige_addresses[0], 0)]
     assert both[0].grab() is not None
-    assert command("127.255.255.255", key=KEY + 1) == []
-    assert command("127.255.255.255", mask=MASK << 1) == []
+    assert command("127.255.255.255", 0, key=KEY + 1) == []
+    assert command("127.255.255.255", 0, mask=MASK << 1) == []
     assert both[1].grab(0.1) is None
 
 
@@ -215,23 +214,23 @@ def test_a_scheduled_action_needs_a_common_time_and_hits_it(group: GigeGroup, he
     both = heads("Action0", "Action0")
     for head in both:
         head.action()
-    at_ns = both[0].now_ns() + 50_000_000
-    assert command("127.255.255.255", at_ns) == [(address, NO_REF_TIME) for address in gige_addresses]
+    at_ns = both[0].now_ns() + 300_000_000
+    assert command("127.255.255.255", 2, at_ns) == [(address, NO_REF_TIME) for address in gige_addresses]
     synchronise(both)
-    at_ns = both[0].now_ns() + 50_000_000
-    assert command("127.255.255.255", at_ns) == [(address, 0) for address in gige_addresses]
+    at_ns = both[0].now_ns() + 300_000_000
+    assert command("127.255.255.255", 2, at_ns) == [(address, 0) for address in gige_addresses]
     for index, head in enumerate(both):
         assert abs(head.grab().get_timestamp() - at_ns) <= 1
         assert group.truth(index)[-1].timestamp_ns == pytest.approx(at_ns, abs=1)
     left, right = starts(group)
     assert 0 < abs(left - right) < 1000                      # PTP's own residue
-    assert command("127.255.255.255", at_ns) == [(address, ACTION_LATE) for address in gige_addresses]
+    assert command("127.255.255.255", 2, at_ns) == [(address, ACTION_LATE) for address in gige_addresses]
     assert [head.grab() is None for head in both] == [False, False]
 
 
 def test_a_trigger_during_exposure_is_dropped_and_counted(group: GigeGroup, heads: Callable[..., list[Head]]) -> None:
     left, _right = heads()
-    left.camera.set_float("ExposureTime", 200_000.0)
+    left.camera.set_float("ExposureTime", 500_000.0)
     for _ in range(3):
         left.camera.software_trigger()
     assert left.grab().get_frame_id() == 1
@@ -270,7 +269,7 @@ def test_auto_exposure_finds_its_grey(gige_addresses: tuple[str, str]) -> None:
 def alive(address: str) -> bool:
     """Whether it answers a discovery."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-        client.settimeout(0.2)
+        client.settimeout(0.5)
         client.connect((address, 3956))
         try:
             client.send(bytes.fromhex("4201000200000001"))
@@ -381,7 +380,7 @@ def test_device_reset_loses_what_was_set(group: GigeGroup, heads: Callable[..., 
     assert left.camera.get_string("PtpStatus") == "Disabled"
     with pytest.raises(GLib.Error, match="access-denied"):
         left.camera.set_float("ExposureTime", 1234.0)
-    do(group, "reboot=0.1@right", "power=off@left")
+    do(group, "reboot=1@right", "power=off@left")
     until(lambda: not alive(gige_addresses[1]))
     until(lambda: alive(gige_addresses[1]))
     assert not alive(gige_addresses[0])
