@@ -91,9 +91,8 @@ def leave() -> NoReturn:
 def cameras(cell: settings.Cell) -> Cameras:
     """The cell file's cameras as a group, not yet open."""
     from binpick.camera import backends
-    from binpick.camera.group import CameraGroup
 
-    return CameraGroup(backends.make(cell.cameras), cell.cameras.max_skew_us)
+    return backends.group(cell.cameras)
 
 
 def run(cell: settings.Cell, rig: Rig, cameras: Cameras) -> None:

@@ -45,7 +45,10 @@ class Frame:
     """One image of one camera, with the facts that prove which instant it shows.
 
     `timestamp_ns` is the start of exposure in the device's own clock; `triggered_ns` and `received_ns` are the host's
-    monotonic clock. `sequence` is the group's trigger counter, `frame_id` the camera's own.
+    monotonic clock. `sequence` is the group's trigger counter, `frame_id` the camera's own. When the exposure began by the
+    host's clock: between `triggered_ns` and `acknowledged_ns` (0: nothing says so), and between the two of `latched_ns` by the
+    device's clock as it was compared (None: it was not). `ptp` is "Master" or "Slave" while that clock keeps together with
+    others, and `ptp_offset_ns` its distance from the master's.
     """
 
     image: Image
@@ -59,11 +62,19 @@ class Frame:
     gain_db: float
     resends: int = 0
     missing: int = 0
+    acknowledged_ns: int = 0
+    latched_ns: tuple[int, int] | None = None
+    ptp: str = ""
+    ptp_offset_ns: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoPair:
-    """Two frames of one trigger. `proof` names what the skew rests on; captured_at is ISO 8601 UTC wall time."""
+    """Two frames of one trigger, and those of a third camera and on; captured_at is ISO 8601 UTC wall time.
+
+    `skew_us` is of the two that may be furthest apart; `proof` names what it rests on: ptp, latch (device clocks compared with
+    the host's), interval (the host's times alone), none.
+    """
 
     left: Frame
     right: Frame
@@ -71,13 +82,24 @@ class StereoPair:
     skew_us: float
     sigma_us: float
     proof: str
+    more: tuple[Frame, ...] = ()
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """Of all cameras, in the rig's order."""
+        return self.left, self.right, *self.more
+
+    @property
+    def arrival_ms(self) -> float:
+        """From the first trigger until all images were there."""
+        return (max(frame.received_ns for frame in self.frames) - min(frame.triggered_ns for frame in self.frames)) / 1e6
 
 
 @dataclass(frozen=True, slots=True)
 class CameraStatus:
     """What a camera says of itself; `error` is empty when it is well.
 
-    `clock` names the common clock its timestamps are in, such as "ptp"; empty: its own.
+    `ptp` is the camera's PtpStatus ("": it has none), `refused` the pairs refused since the start, of all cameras together.
     """
 
     name: str
@@ -90,7 +112,10 @@ class CameraStatus:
     resends: int = 0
     error: str = ""
     simulated: bool = False
-    clock: str = ""
+    ptp: str = ""
+    ptp_offset_ns: float = 0.0
+    packet_size: int = 0
+    refused: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,15 +1,30 @@
 """The one place that picks a camera backend."""
 
-from binpick.camera.aravis import AravisCamera
+from binpick.camera import sync
+from binpick.camera.aravis import AravisCamera, Setup
 from binpick.camera.base import Camera
 from binpick.camera.files import FileCamera
+from binpick.camera.group import CameraGroup
+from binpick.camera.starter import Starter
 from binpick.settings.cell import AravisCameras, FileCameras
 
+NAMES = ("left", "right", "third", "fourth", "fifth")
 
-def make(settings: AravisCameras | FileCameras) -> tuple[Camera, Camera]:
-    """The left and the right camera of a cell file, not yet open."""
+
+def make(settings: AravisCameras | FileCameras) -> tuple[Camera, ...]:
+    """The cameras of a cell file in the rig's order, left and right first, not yet open."""
     if isinstance(settings, FileCameras):
         return FileCamera("left", settings.left), FileCamera("right", settings.right)
-    left, right = (AravisCamera(name, place.address, place.serial, settings.packet_size, settings.heartbeat_ms)
-                   for name, place in (("left", settings.left), ("right", settings.right)))
-    return left, right
+    places = (settings.left, settings.right, *settings.more)
+    return tuple(
+        AravisCamera(NAMES[index], place.address, place.serial, Setup(
+            sync.steps(settings, first=index == 0), settings.pixel_format, settings.packet_size,
+            tuple(other.address for other in (*places[:index], *places[index + 1:]))))
+        for index, place in enumerate(places))
+
+
+def group(settings: AravisCameras | FileCameras) -> CameraGroup:
+    """The cameras of a cell file as one instrument, not yet open."""
+    if isinstance(settings, FileCameras):
+        return CameraGroup(make(settings), settings.max_skew_us)
+    return CameraGroup(make(settings), settings.max_skew_us, starter=Starter(settings.sync, sync.device_key(settings)))

@@ -1,4 +1,4 @@
-"""What a camera is to the rest: five verbs, each bounded by a deadline, and a status anybody may read at any time."""
+"""What a camera is to the rest: its verbs, each bounded by a deadline, and a status anybody may read at any time."""
 
 import time
 from collections.abc import Callable
@@ -21,7 +21,7 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str:
-        """"left" or "right"; named in every error."""
+        """"left", "right", "third", ...; named in every error."""
         ...
 
     def open(self, deadline_ns: MonotonicNs) -> None:
@@ -34,6 +34,18 @@ class Camera(Protocol):
 
     def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
         """Start one exposure. Raises CameraLost."""
+        ...
+
+    def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+        """Something else will start one exposure: a wire from another camera, or a datagram to all. Raises CameraLost."""
+        ...
+
+    def disarm(self, deadline_ns: MonotonicNs) -> None:
+        """Perhaps no image will come of the last `arm`; one that comes nevertheless is dropped. Raises CameraLost."""
+        ...
+
+    def device_ns(self, host_ns: MonotonicNs) -> int | None:
+        """Its clock's time at a host time; None while nobody knows."""
         ...
 
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:

@@ -54,6 +54,17 @@ class FileCamera:
         self._opened()
         self._triggered = (sequence, self._clock())
 
+    def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+        """As a trigger."""
+        self.trigger(sequence, deadline_ns)
+
+    def disarm(self, deadline_ns: MonotonicNs) -> None:
+        """Nothing."""
+
+    def device_ns(self, host_ns: MonotonicNs) -> int | None:  # noqa: ARG002
+        """None: a file's clock stands still."""
+        return None
+
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:  # noqa: ARG002
         """The file's image. Raises CameraLost when there was no such trigger."""
         image = self._opened()
@@ -72,7 +83,7 @@ class FileCamera:
     def status(self) -> CameraStatus:
         """Always simulated: no camera looks into the bin."""
         return CameraStatus(self._name, connected=self._image is not None, model="file", address=str(self._path),
-                            frames=self._frames, simulated=True, clock="file")
+                            frames=self._frames, simulated=True)
 
     def _opened(self) -> Image:
         if self._image is None:

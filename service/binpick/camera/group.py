@@ -1,15 +1,18 @@
-"""Two cameras as one instrument: one light, one trigger, and a pair only when both images are proved to show one instant."""
+"""Cameras as one instrument: one light, one trigger, and a pair only when all images are proved to show one instant."""
 
 import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TypeVar
 
+from binpick.camera import proof
 from binpick.camera.base import Camera, Clock, MonotonicNs
+from binpick.camera.proof import Skew
+from binpick.camera.starter import Starter
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import CameraError, Code, CycleTimeout, PairRefused
 
@@ -25,26 +28,32 @@ SECOND_NS = 150_000_000
 """What is left at least for the second camera, when waiting for the first has used up the time."""
 TRIES = 3
 """Shots for one pair; one of a projector's numbered patterns has a single one, since its next strobe shows the next pattern."""
-CLOCK_SIGMA_US = 1.0
-"""Of time stamps on one clock: what PTP reaches on one switch."""
+SOFTWARE = Starter()
+PTP_NS = 5_000_000_000
+"""Longest wait for the cameras' PTP, in the one mode that needs it."""
+SETTLE_S = 0.1
+"""For images that may have been started by a command that not every camera took."""
 
 log = logging.getLogger(__name__)
 
 
 class CameraGroup:
-    """The left and the right camera, used by one thread. `statuses` may be read by any."""
+    """The left, the right and perhaps more cameras, used by one thread. `statuses` may be read by any."""
 
-    def __init__(self, cameras: tuple[Camera, Camera], max_skew_us: float, clock: Clock = time.monotonic_ns,
-                 wall_clock: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
+    def __init__(self, cameras: tuple[Camera, ...], max_skew_us: float, clock: Clock = time.monotonic_ns,
+                 wall_clock: Callable[[], datetime] = lambda: datetime.now(UTC), starter: Starter = SOFTWARE) -> None:
         self._cameras = cameras
+        self._starter = starter
+        self._refused = 0
         self._max_skew_us = max_skew_us
         self._clock = clock
         self._wall_clock = wall_clock
-        self._open = [False, False]
-        self._errors = ["", ""]
-        self._due: list[MonotonicNs | None] = [None, None]
+        self._open = [False] * len(cameras)
+        self._errors = [""] * len(cameras)
+        self._due: list[MonotonicNs | None] = [None] * len(cameras)
         self._light: tuple[float, float, bool, int] | None = None
         self._sequence = 0
+        self._started_ns: MonotonicNs = 0
 
     def open(self, deadline_ns: MonotonicNs) -> None:
         """Opens those that are not open, one after the other. Raises one CameraError that names every broken camera."""
@@ -64,6 +73,7 @@ class CameraGroup:
         with contextlib.suppress(PairRefused):       # nobody wants that image
             self._each(lambda i, camera: self._due[i] and self._fetch(i, camera))
         self._configure(light)
+        self._await_clocks(deadline_ns)
         tries, patience_ns = 1 if light.pattern else TRIES, COMMAND_NS
         while True:
             if self._clock() >= deadline_ns:
@@ -71,33 +81,60 @@ class CameraGroup:
             try:
                 return self._shoot(light, patience_ns)
             except PairRefused as refusal:
+                self._refused += 1
                 tries, patience_ns = tries - 1, AGAIN_NS
                 if not tries:
                     raise
                 log.info("shooting again: %s", refusal)
 
+    def _await_clocks(self, deadline_ns: MonotonicNs) -> None:
+        until_ns = min(deadline_ns, self._clock() + PTP_NS)
+        while why := self._starter.unready(self.statuses()):
+            if self._clock() >= until_ns:
+                self._refused += 1
+                raise PairRefused(why)
+            time.sleep(0.02)
+
     def _shoot(self, light: Light, patience_ns: int) -> StereoPair:
-        self._sequence += 1
         captured_at = self._wall_clock().isoformat(timespec="milliseconds")
-        ticks = [self._clock()]
-
-        def trigger(index: int, camera: Camera) -> None:
-            camera.trigger(self._sequence, self._answer_by(patience_ns))
-            ticks.append(self._clock())
-            self._due[index] = ticks[-1] + int(light.exposure_us * 1000) + IMAGE_NS
-
-        self._each(trigger)
-        left, right = self._each(lambda i, camera: self._fetch(i, camera))
-        for frame in (left, right):
-            self._check(frame, ticks[0])
+        self._start(light, patience_ns)
+        frames = tuple(self._each(lambda i, camera: self._fetch(i, camera)))
+        for frame in frames:
+            self._check(frame)
             frozen(frame.image)
-        if left.image.shape != right.image.shape:
-            raise PairRefused(f"the images differ in size: left {_size(left)}, right {_size(right)} pixels")
-        skew_us, sigma_us, proof = self._skew(left, right, ticks)
-        if abs(skew_us) > self._max_skew_us:
-            raise PairRefused(f"the images were exposed {abs(skew_us):.0f} µs apart ({proof}), more than the "
-                              f"{self._max_skew_us:.0f} µs allowed (max_skew_us)")
-        return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew_us, sigma_us=sigma_us, proof=proof)
+        left, right, *more = frames
+        for other in (right, *more):
+            if other.image.shape != left.image.shape:
+                raise PairRefused(f"the images differ in size: left {_size(left)}, {other.camera} {_size(other)} pixels")
+        skew = self._judge(frames)
+        return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew.us,
+                          sigma_us=skew.sigma_us if math.isfinite(skew.sigma_us) else 0.0, proof=skew.proof, more=tuple(more))
+
+    def _start(self, light: Light, patience_ns: int) -> None:
+        """One exposure of every camera."""
+        self._sequence += 1
+        self._started_ns = self._clock()
+
+        def begin(index: int, camera: Camera) -> None:
+            verb = camera.arm if self._starter.follows(index) else camera.trigger
+            verb(self._sequence, self._answer_by(patience_ns))
+            self._due[index] = self._clock() + int(light.exposure_us * 1000) + IMAGE_NS
+
+        self._each(begin, self._starter.order(len(self._cameras)))
+        if why := self._starter.fire(self._cameras, self._clock):
+            self._each(lambda _, camera: camera.disarm(self._answer_by(patience_ns)))
+            self._due = [None] * len(self._cameras)
+            time.sleep(light.exposure_us / 1e6 + SETTLE_S)
+            raise PairRefused(why)
+
+    def _judge(self, frames: tuple[Frame, ...]) -> Skew:
+        """The worst skew among them. Raises PairRefused when it may be beyond the limit."""
+        skew = proof.worst(frames)
+        if skew.worst_us > self._max_skew_us:
+            raise PairRefused(f"the images may have been exposed {skew.worst_us:.0f} µs apart ({skew.us:.0f} µs, 1-sigma "
+                              f"{skew.sigma_us:.0f} µs by {skew.proof}), more than the {self._max_skew_us:.0f} µs allowed "
+                              "(max_skew_us)")
+        return skew
 
     def _fetch(self, index: int, camera: Camera) -> Frame:
         """The image of its last trigger."""
@@ -109,15 +146,16 @@ class CameraGroup:
         return self._clock() + (patience_ns if all(self._open) else SECOND_NS)
 
     def close(self) -> None:
-        """Closes both, at most 1 s each; never raises."""
+        """Closes all, at most 1 s each; never raises."""
         for index, camera in enumerate(self._cameras):
             camera.close()
             self._open[index] = False
 
     def statuses(self) -> tuple[CameraStatus, ...]:
-        """Left and right; `error` tells why a camera is closed."""
+        """In the rig's order; `error` tells why a camera is closed."""
         found = (camera.status() for camera in self._cameras)
-        return tuple(replace(status, error=status.error or error) for status, error in zip(found, self._errors, strict=True))
+        return tuple(replace(status, error=status.error or error, refused=self._refused)
+                     for status, error in zip(found, self._errors, strict=True))
 
     def _open_one(self, index: int, camera: Camera, deadline_ns: MonotonicNs) -> None:
         camera.open(deadline_ns)
@@ -133,10 +171,11 @@ class CameraGroup:
             self._each(lambda _, camera: camera.configure(light, self._answer_by(COMMAND_NS)))
             self._light = wanted
 
-    def _each(self, verb: Callable[[int, Camera], T]) -> list[T]:
-        """The verb's answers of both; cameras that fail are named in one error and closed: not for an incomplete image."""
+    def _each(self, verb: Callable[[int, Camera], T], order: Sequence[int] = ()) -> list[T]:
+        """The verb's answers of all; cameras that fail are named in one error and closed: not for an incomplete image."""
         answers, broken = [], []
-        for index, camera in enumerate(self._cameras):
+        for index in order or range(len(self._cameras)):
+            camera = self._cameras[index]
             try:
                 answers.append(verb(index, camera))
             except CameraError as error:
@@ -151,24 +190,13 @@ class CameraGroup:
             raise kind("; ".join(map(str, broken)))
         return answers
 
-    def _check(self, frame: Frame, started_ns: MonotonicNs) -> None:
+    def _check(self, frame: Frame) -> None:
         if frame.missing:
             raise PairRefused(f"camera {frame.camera}: {frame.missing} packets of the image are missing", frame.camera)
-        if frame.sequence != self._sequence or frame.triggered_ns < started_ns:
+        if frame.sequence != self._sequence or frame.triggered_ns < self._started_ns:
             raise PairRefused(f"camera {frame.camera}: the image is older than its trigger", frame.camera)
-
-    def _skew(self, left: Frame, right: Frame, ticks: list[MonotonicNs]) -> tuple[float, float, str]:
-        """Right minus left start of exposure, its 1-sigma, both µs, and what that rests on.
-
-        On a common clock the time stamps say it. Else the host does: each exposure began somewhere between sending its
-        trigger and having its acknowledge, uniformly; two cameras of one model add the same delay.
-        """
-        clocks = {camera.status().clock for camera in self._cameras}
-        if len(clocks) == 1 and (clock := clocks.pop()):
-            return (right.timestamp_ns - left.timestamp_ns) / 1000, CLOCK_SIGMA_US, clock
-        sent, between, acknowledged = ticks
-        sigma_us = math.hypot(between - sent, acknowledged - between) / math.sqrt(12) / 1000
-        return (acknowledged - sent) / 2 / 1000, sigma_us, "host"
+        if wrong := proof.misdated(frame):
+            raise PairRefused(f"camera {frame.camera}: {wrong}", frame.camera)
 
 
 def _size(frame: Frame) -> str:

@@ -4,6 +4,7 @@ A thread cannot be cancelled. One that hangs in a foreign call is retired: nobod
 it takes leave of its objects by itself.
 """
 
+import logging
 import queue
 import threading
 import time
@@ -15,15 +16,22 @@ from typing import Any, TypeVar
 from binpick.camera.base import MonotonicNs, remaining_s
 from binpick.errors import BinpickError
 
+log = logging.getLogger(__name__)
 T = TypeVar("T")
 Posted = tuple[Callable[[], Any], "Future[Any]"]
 
 
 class Owner:
-    """Runs posted functions in order. `farewell` runs on the same thread when the owner retires."""
+    """Runs posted functions in order. `farewell` runs on the same thread when the owner retires.
 
-    def __init__(self, name: str, farewell: Callable[[], None]) -> None:
+    `rest` does so when nothing is posted at the time (host monotonic) that `due_ns` names; one that raises is not called again.
+    """
+
+    def __init__(self, name: str, farewell: Callable[[], None], rest: Callable[[], None] = lambda: None,
+                 due_ns: Callable[[], MonotonicNs | None] = lambda: None) -> None:
         self._farewell = farewell
+        self._rest = rest
+        self._due_ns: Callable[[], MonotonicNs | None] = due_ns
         self._posted: queue.SimpleQueue[Posted | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -43,10 +51,25 @@ class Owner:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        while (posted := self._posted.get()) is not None:
+        while True:
+            due_ns = self._due_ns()
+            try:
+                posted = self._posted.get(timeout=None if due_ns is None else remaining_s(due_ns))
+            except queue.Empty:
+                self._take_rest()
+                continue
+            if posted is None:
+                break
             _carry_out(*posted)
             del posted        # the function may hold the driver's objects
         self._farewell()
+
+    def _take_rest(self) -> None:
+        try:
+            self._rest()
+        except Exception as error:    # noqa: BLE001 - nobody waits for it, and the next verb fails for the same reason
+            log.info("%s: %s", self._thread.name, error)
+            self._due_ns = lambda: None
 
 
 def _carry_out(function: Callable[[], Any], future: "Future[Any]") -> None:

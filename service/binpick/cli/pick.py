@@ -79,7 +79,6 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
 
     from binpick import recording, settings
     from binpick.camera import backends
-    from binpick.camera.group import CameraGroup
     from binpick.result import CycleInput
 
     job = settings.resolve(cell, request.recipe)
@@ -95,7 +94,7 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         typer.echo(f"two images are one shot: the other {len(job.recipe.shots) - 1} of the recipe are left out", err=True)
         job = _exposed(job, job.recipe.model_copy(update={"shots": job.recipe.shots[:1]}))
     files = settings.FileCameras(backend="files", left=left, right=right)
-    cameras = CameraGroup(backends.make(files), files.max_skew_us)
+    cameras = backends.group(files)
     deadline_ns = time.monotonic_ns() + 10_000_000_000
     cameras.open(deadline_ns)
     try:

@@ -11,6 +11,8 @@ from binpick.settings.recipe import Bin, Recipe
 from binpick.settings.tool import SuctionTool, Tool
 
 Port = Annotated[int, Field(ge=1, le=65535)]
+PixelFormat = Literal["Mono8", "Mono10", "Mono10p", "Mono12", "Mono12p", "Mono12Packed", "BayerRG8"]
+Sync = Literal["line", "scheduled_action", "action", "software"]
 
 
 class CameraAddress(Strict):
@@ -28,20 +30,36 @@ class CameraAddress(Strict):
         return self
 
 
+class SyncLines(Strict):
+    """The wire of `sync: line`, in the cameras' own names; Line2 is left for the projector."""
+
+    output: Literal["Line0", "Line1"] = "Line1"
+    """The first camera's line that is high while it exposes."""
+    input: Literal["Line0", "Line1", "Line3"] = "Line0"
+    """The line of every other camera that it is wired to."""
+
+
 class AravisCameras(Strict):
-    """Two GigE Vision cameras driven by Aravis."""
+    """Two to five GigE Vision cameras driven by Aravis; depth is made from the first two."""
 
     backend: Literal["aravis"] = "aravis"
     left: CameraAddress = CameraAddress(address="169.254.1.2")
     """The rig's first camera."""
     right: CameraAddress = CameraAddress(address="169.254.2.2")
     """The rig's second camera."""
-    sync: Literal["software"] = "software"
-    """How the two are triggered: one software trigger each, 0.1 to 0.5 ms apart."""
+    more: Annotated[tuple[CameraAddress, ...], Field(max_length=3)] = ()
+    """The rig's third, fourth and fifth camera: triggered with the others, and part of what is proved of a pair."""
+    sync: Sync = "software"
+    """How they are triggered. line: the first camera's exposure triggers the others by a wire; scheduled_action: one datagram
+    names a time of their PTP clock; action: one datagram, at once; software: one trigger each, 0.1 to 0.5 ms apart."""
+    lines: SyncLines = SyncLines()
+    """The wire of `sync: line`."""
     max_skew_us: Annotated[float, Field(gt=0, le=1_000_000)] = 5000.0
-    """A pair exposed further apart is refused, µs."""
-    packet_size: Annotated[int, Field(ge=576, le=16000)] = 1500
-    """GVSP packet size with its IP header, bytes; not above the network's MTU."""
+    """A pair that may be further apart, at 3 sigma of what proves its skew, is refused, µs."""
+    pixel_format: PixelFormat = "Mono8"
+    """What the cameras send; everything is turned into 8-bit grey."""
+    packet_size: Literal["auto"] | Annotated[int, Field(ge=576, le=16000)] = "auto"
+    """GVSP packet size with its IP header, bytes; not above the network's MTU. auto: the largest that arrives."""
     heartbeat_ms: Annotated[int, Field(ge=1500, le=60000)] = 3000
     """After this silence a camera frees itself of its controller, ms."""
 

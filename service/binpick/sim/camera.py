@@ -9,7 +9,7 @@ from binpick.data import CameraStatus, Frame, Image, Light
 from binpick.errors import CameraLost
 
 Expose: TypeAlias = Callable[[int, Light, int], Image]
-NAMES = ("left", "right")
+NAMES = ("left", "right", "third", "fourth", "fifth")
 # how often a stuck or exposing camera looks at its fault
 TICK_S = 0.02
 
@@ -28,12 +28,12 @@ class SimCamera:
         self._open = False
         self._light = Light(6000.0, 0.0, True)
         self._triggered: tuple[int, MonotonicNs] | None = None
-        self._frames = self._failures = 0
+        self._frames = self._failures = self._acknowledged_ns = 0
         self._error = ""
 
     @property
     def name(self) -> str:
-        """"left" or "right"."""
+        """"left", "right", "third", ..."""
         return NAMES[self._index]
 
     def open(self, deadline_ns: MonotonicNs) -> None:
@@ -52,6 +52,19 @@ class SimCamera:
         self._require_open()
         self._obey(deadline_ns)
         self._triggered = (sequence, self._clock())
+        self._acknowledged_ns = self._clock()
+
+    def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+        """In one process nothing lies between the cameras: exposure starts now. Raises CameraLost."""
+        self.trigger(sequence, deadline_ns)
+
+    def disarm(self, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002
+        """Forgets the trigger."""
+        self._triggered = None
+
+    def device_ns(self, host_ns: MonotonicNs) -> int | None:
+        """Its clock is the host's."""
+        return host_ns
 
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
         """The frame of that trigger once its exposure has elapsed. Raises CameraLost."""
@@ -66,7 +79,7 @@ class SimCamera:
         self._frames += 1
         return Frame(image=image, camera=self.name, sequence=sequence, frame_id=self._frames, timestamp_ns=started,
                      triggered_ns=started, received_ns=self._clock(), exposure_us=self._light.exposure_us,
-                     gain_db=self._light.gain_db)
+                     gain_db=self._light.gain_db, acknowledged_ns=self._acknowledged_ns)
 
     def close(self) -> None:
         """Forgets the trigger."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from binpick.camera import probe
-from binpick.camera.aravis.driver import Driver
+from binpick.camera.aravis.driver import Driver, Setup
 from binpick.camera.base import MonotonicNs, remaining_s
 from binpick.camera.owner import Owner
 from binpick.data import CameraStatus, Frame, Light
@@ -23,12 +23,11 @@ class AravisCamera:
     leaves that thread behind; the next `open` starts another. An incomplete image counts as a failure, but closes nothing.
     """
 
-    def __init__(self, name: str, address: str, serial: str, packet_size: int = 1500, heartbeat_ms: int = 3000) -> None:
+    def __init__(self, name: str, address: str, serial: str, setup: Setup) -> None:
         self._name = name
         self._address = address
         self._serial = serial
-        self._packet_size = packet_size
-        self._heartbeat_ms = heartbeat_ms
+        self._setup = setup
         self._status = CameraStatus(name, connected=False, address=address, serial=serial)
         self._driver: Driver | None = None
         self._owner: Owner | None = None
@@ -47,8 +46,9 @@ class AravisCamera:
                                             "and the address in the cell file", self._name))
         if self._retired is not None:      # may still hold the camera; when that lives, it lets go soon
             self._retired.join(min(HANDOVER_S, remaining_s(deadline_ns) / 2))
-        driver = Driver(self._name, self._packet_size, self._heartbeat_ms)
-        self._driver, self._owner = driver, Owner(f"binpick-cam-{self._name}", driver.close)
+        driver = Driver(self._name, self._setup)
+        self._driver = driver
+        self._owner = Owner(f"binpick-cam-{self._name}", driver.close, driver.rest, lambda: driver.due_ns)
         address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
         facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
         self._status = replace(self._status, connected=True, error="", address=address, **facts)
@@ -63,12 +63,26 @@ class AravisCamera:
         driver = self._opened()
         self._do("triggering", driver.trigger, deadline_ns)
 
+    def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002
+        """Makes room for an image that something else will start."""
+        driver = self._opened()
+        self._do("preparing", driver.arm, deadline_ns)
+
+    def disarm(self, deadline_ns: MonotonicNs) -> None:
+        """The image may come, or not."""
+        driver = self._opened()
+        self._do("waiting", driver.disarm, deadline_ns)
+
+    def device_ns(self, host_ns: MonotonicNs) -> int | None:
+        """By the latches so far."""
+        return self._opened().clock.device_ns(host_ns)
+
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
         """The frame of that trigger. Raises CameraLost when none comes, PairRefused when packets stayed away."""
         driver = self._opened()
-        frame, clock = self._do("waiting for its image", lambda: driver.grab(sequence, deadline_ns), deadline_ns)
+        frame = self._do("waiting for its image", lambda: driver.grab(sequence, deadline_ns), deadline_ns)
         status = self._status
-        self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends, clock=clock)
+        self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends)
         return frame
 
     def close(self) -> None:
@@ -82,8 +96,12 @@ class AravisCamera:
         self._status = replace(self._status, connected=False)
 
     def status(self) -> CameraStatus:
-        """What the last verb left behind."""
-        return self._status
+        """What the last verb left behind, and what PTP said since."""
+        driver = self._driver
+        if driver is None:
+            return self._status
+        state, offset_ns = driver.ptp
+        return replace(self._status, ptp=state, ptp_offset_ns=offset_ns)
 
     def _opened(self) -> Driver:
         if self._driver is None:
