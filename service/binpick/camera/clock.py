@@ -2,8 +2,8 @@
 
 A latch's device time was taken somewhere between sending the command and having its acknowledge, nobody knows where. Instead of
 a guess in the middle, all straight lines (offset, drift) through all these intervals are kept: a polygon, whose extent at a
-time is a bound that holds whatever the network did (Duda 1987; the same idea as NTP's Marzullo intersection). A lost datagram or a
-busy host makes an interval wide, never wrong. Where no line goes through all, the clock was stepped: the oldest go.
+time is a bound that holds whatever the network did (Duda 1987; NTP intersects intervals as Marzullo did). A lost datagram or
+a busy host makes an interval wide, never wrong. Where no line goes through all, the clock was stepped: the oldest go.
 """
 
 import math

@@ -43,7 +43,7 @@ def worst(frames: tuple[Frame, ...]) -> Skew:
 
 
 def misdated(frame: Frame) -> str:
-    """What is wrong with the image's own time stamp: it was begun before its trigger was sent, or after it had come; else ""."""
+    """What is wrong with the image's own time stamp, "": nothing; it cannot precede its trigger, nor follow its arrival."""
     if frame.latched_ns is None:
         return ""
     early, late = frame.latched_ns
@@ -66,7 +66,7 @@ def _latched(first: Frame, second: Frame) -> Skew | None:
 
 
 def _interval(first: Frame, second: Frame) -> Skew | None:
-    """Each exposure began between its trigger and what proved that it had; cameras of one model add the same delay."""
+    """Each exposure began between its trigger and what proved that it had; one model has one delay."""
     return _between(_window(first), _window(second), "interval")
 
 

@@ -182,3 +182,29 @@ def pose(
         typer.echo(json.dumps(run, indent=1))
     else:
         Console(width=190).print(poses.table(run))
+
+
+@bench.command()
+def cameras(
+    pairs: Annotated[int, typer.Option(help="Pairs in each series.", min=5, max=10000)] = 500,
+    only: Annotated[str, typer.Option(help="Series whose name holds this, such as line, PTP, apart or lost.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """The pair on simulated GigE Vision cameras: reported against true skew, time to both images, lost packets."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import track
+
+    from binpick.errors import InputError
+    from binpick.lab import cameras as lab
+
+    chosen = [trial for trial in lab.programme(pairs) if only in trial.name]
+    if not chosen:
+        raise InputError(f"--only {only}: there are {', '.join(trial.name for trial in lab.programme(pairs))}")
+    console = Console(stderr=True)
+    rows = list(track(lab.run(chosen), "Taking pairs", total=len(chosen), console=console, transient=True))
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+    else:
+        Console(width=190).print(lab.table(rows))

@@ -21,7 +21,7 @@ from binpick.camera.clock import DeviceClock
 from binpick.camera.proof import SYNCHRONISED
 from binpick.camera.sync import Step
 from binpick.data import Frame, Light
-from binpick.errors import CameraError, CameraHeld, CameraNotFound
+from binpick.errors import CameraHeld, CameraNotFound
 from binpick.settings.cell import PixelFormat
 
 PROJECTOR_LINE = "Line2"
@@ -131,20 +131,13 @@ class Driver:
         assert self._stream is not None
         camera = self._camera
         with self._translating("setting exposure and gain"):
-            camera.set_exposure_time(light.exposure_us)
-            camera.set_gain(light.gain_db)
-            self._exposure_us, self._gain_db = float(camera.get_exposure_time()), float(camera.get_gain())
-            self._near("ExposureTime", light.exposure_us, self._exposure_us, light.exposure_us * EXPOSURE_TOLERANCE, "µs")
-            self._near("Gain", light.gain_db, self._gain_db, GAIN_TOLERANCE_DB, "dB")
+            apart_us = light.exposure_us * EXPOSURE_TOLERANCE
+            self._exposure_us = self._features.approach("ExposureTime", light.exposure_us, apart_us)
+            self._gain_db = self._features.approach("Gain", light.gain_db, GAIN_TOLERANCE_DB)
             if self._features.has("LineSource"):
                 camera.set_string("LineSelector", PROJECTOR_LINE)
                 camera.set_string("LineSource", "ExposureActive" if light.projector else "Off")
         self._stream.expect(self._exposure_us)
-
-    def _near(self, feature: str, wanted: float, found: float, tolerance: float, unit: str) -> None:
-        if abs(found - wanted) > tolerance:
-            raise CameraError(f"camera {self._name}: {feature} should be {wanted:g} {unit}, but is {found:g} {unit}: check the "
-                              "recipe's light", self._name)
 
     def arm(self) -> None:
         """Something else will start an exposure. Raises CameraLost."""

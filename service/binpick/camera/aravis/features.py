@@ -32,9 +32,22 @@ class Features:
             refusal = self._write(step)
             found = step.value if step.secret and not refusal else self._found(step)
             if found != step.value:
-                raise CameraError(f"camera {self._name}: {step.feature} should be {step.value}, but "
-                                  f"{f'is {found}' if found is not None else 'it is not there'}{refusal and f' ({refusal})'}: "
-                                  "check the cell file's cameras, and the camera's model and firmware", self._name)
+                raise self._unlike(step, found, refusal)
+
+    def approach(self, feature: str, wanted: float, tolerance: float) -> float:
+        """Sets a number that the camera may round; what it is now. Raises as `apply` does."""
+        step = Step(feature, float(wanted))
+        refusal = self._write(step)
+        found = self._found(step)
+        if found is None or abs(float(found) - wanted) > tolerance:
+            raise self._unlike(step, found, refusal)
+        return float(found)
+
+    def _unlike(self, step: Step, found: Value | None, refusal: str) -> CameraError:
+        is_now = f"is {found}" if found is not None else "it is not there"
+        return CameraError(f"camera {self._name}: {step.feature} should be {step.value}, but {is_now}"
+                           f"{f' ({refusal})' if refusal else ''}: check the cell file, and the camera's model and firmware",
+                           self._name)
 
     def _write(self, step: Step) -> str:
         """Why the camera did not accept it, "" when it did. Raises CameraLost, CameraHeld."""

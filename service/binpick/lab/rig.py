@@ -1,0 +1,128 @@
+"""The simulated cameras in a process of their own, so that nothing but packets lies between; a pipe tells their truth."""
+
+import multiprocessing
+import os
+import socket
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from binpick.data import Image, Light
+from binpick.errors import PortInUse
+from binpick.sim.gige import GigeGroup
+from binpick.sim.gige.clock import host_ns
+from binpick.sim.gige.gvcp import PORT
+from binpick.sim.gige.ptp import Oscillator
+
+START_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One image as it really was: the start of exposure on the host's clock (since 1970), and the checksum of what was sent."""
+
+    started_ns: int
+    crc32: int
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is simulated. `apart`: each camera on a port of its own, where no PTP is heard; drift and offset are of the
+    second camera's clock against the host's."""
+
+    addresses: tuple[str, ...]
+    size_px: tuple[int, int] = (1936, 1216)
+    apart: bool = False
+    offset_s: float = 0.78
+    drift_ppm: float = 40.0
+
+
+def free(cameras: int = 2) -> tuple[str, ...]:
+    """Loopback addresses whose GigE Vision port was free a moment ago. Raises PortInUse."""
+    for number in sorted(range(20, 250), key=lambda place: (place - os.getpid()) % 230):      # not where others begin
+        addresses = tuple(f"127.0.{number}.{2 + index}" for index in range(cameras))
+        with ExitStack() as probes:
+            try:
+                for address in addresses:
+                    probes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)).bind((address, PORT))
+            except OSError:
+                continue
+            return addresses
+    raise PortInUse(f"no free loopback addresses for {cameras} simulated cameras (udp port {PORT})")
+
+
+class Rig:
+    """Runs while it is entered."""
+
+    def __init__(self, plan: Plan) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, self._other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(self._other, plan), daemon=True, name="binpick-rig")
+
+    def __enter__(self) -> "Rig":
+        self._process.start()
+        self._other.close()
+        try:
+            if self._pipe.poll(START_S) and self._pipe.recv() == "up":
+                return self
+        except EOFError:
+            pass
+        raise PortInUse("the simulated cameras did not start")
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._pipe.send(("stop",))
+        self._process.join(5)
+
+    def change(self, index: int, **changes: Any) -> None:
+        """Other conditions (fields of sim.gige.conditions.Conditions) for one camera."""
+        self._ask("change", index, changes)
+
+    def lose(self, fraction: float, seed: int) -> None:
+        """All cameras lose that share of their packets from now on, resent ones too."""
+        self._ask("lose", fraction, seed)
+
+    def truth(self, index: int) -> dict[int, Exposure]:
+        """That camera's images by frame id."""
+        return {block: Exposure(started, crc) for block, started, crc in self._ask("truth", index)}
+
+    def _ask(self, *what: Any) -> Any:
+        self._pipe.send(what)
+        return self._pipe.recv()
+
+
+def _serve(pipe: Connection, plan: Plan) -> None:
+    width, height = plan.size_px
+    scenes = [_scene(index, width, height) for index in range(len(plan.addresses))]
+
+    def image(index: int, _light: Light, shot: int) -> Image:
+        return scenes[index] + np.uint8(shot & 0xFF)
+
+    with GigeGroup(image, plan.addresses, plan.size_px, apart=plan.apart) as group:
+        for index in range(1, len(plan.addresses)):
+            group.ptp.tune(index, Oscillator(int(plan.offset_s * 1e9), int(plan.drift_ppm * 1000)), host_ns())
+        pipe.send("up")
+        while (what := pipe.recv())[0] != "stop":
+            pipe.send(_answer(group, *what))
+
+
+def _answer(group: GigeGroup, verb: str, *arguments: Any) -> Sequence[tuple[int, int, int]]:
+    match verb:
+        case "change":
+            index, changes = arguments
+            group.change(index, **changes)
+        case "lose":
+            group.drop_packets(*arguments)
+        case "truth":
+            return [(entry.block, entry.started_ns, entry.crc32) for entry in group.truth(*arguments) if entry.sent]
+    return []
+
+
+def _scene(index: int, width: int, height: int) -> Image:
+    """A picture without repetition from packet to packet."""
+    ramp = np.arange(width * height, dtype=np.uint32).reshape(height, width)
+    return ((ramp * np.uint32(2654435761) >> np.uint32(24)) + np.uint32(index * 101)).astype(np.uint8)
