@@ -109,7 +109,7 @@ def answer(inputs: CycleInput, frames: Frames, timing_ms: dict[str, float], code
     """The result of a cycle that got as far as what is given. Without `filled` the bin was not looked into."""
     pair, job = inputs.pair, inputs.job
     worst = max(inputs.pairs, key=lambda shot: abs(shot.skew_us))
-    every = [frame for shot in inputs.pairs for frame in (shot.left, shot.right)]
+    every = [frame for shot in inputs.pairs for frame in shot.frames]
     lost = {k: v for k, v in (counts or {}).items() if v and (k in REASONS or k.startswith("gate_"))}
     return Result(
         cycle_id=inputs.cycle_id, request=inputs.request, captured_at=pair.captured_at, simulated=inputs.simulated,
@@ -117,7 +117,8 @@ def answer(inputs: CycleInput, frames: Frames, timing_ms: dict[str, float], code
         bin=_bin(job, frames, filled),
         grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
         sync=SyncMessage(skew_us=worst.skew_us, sigma_us=worst.sigma_us, proof=worst.proof,
-                         resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every)),
+                         resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every),
+                         exposure_us=worst.left.exposure_us, gain_db=worst.left.gain_db, arrival_ms=round(worst.arrival_ms, 3)),
         timing_ms=timing_ms,
         inputs=Inputs(rig_sha256=inputs.rig.sha256, settings_sha256=job.sha256,
                       frame_ids=(pair.left.frame_id, pair.right.frame_id),

@@ -99,7 +99,8 @@ class StereoPair:
 class CameraStatus:
     """What a camera says of itself; `error` is empty when it is well.
 
-    `ptp` is the camera's PtpStatus ("": it has none), `refused` the pairs refused since the start, of all cameras together.
+    `ptp` is the camera's PtpStatus ("": it has none), `ptp_offset_us` its distance from the master, to 0.1 µs; `refused` the
+    pairs refused since the start, of all cameras together.
     """
 
     name: str
@@ -113,7 +114,7 @@ class CameraStatus:
     error: str = ""
     simulated: bool = False
     ptp: str = ""
-    ptp_offset_ns: float = 0.0
+    ptp_offset_us: float = 0.0
     packet_size: int = 0
     refused: int = 0
 

@@ -68,13 +68,20 @@ class BinMessage(Wire):
 
 
 class SyncMessage(Wire):
-    """How well the two images are proved to show one instant."""
+    """How well the images are proved to show one instant, and what they were taken with.
+
+    `proof` is ptp, latch (device clocks compared with the host's), interval (the host's times alone) or none; `arrival_ms` is
+    from the trigger until all images were here.
+    """
 
     skew_us: float
     sigma_us: float
     proof: str
     resends: int
     missing: int
+    exposure_us: float = 0.0
+    gain_db: float = 0.0
+    arrival_ms: float = 0.0
 
 
 class RecipeMessage(Wire):

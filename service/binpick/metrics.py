@@ -22,6 +22,7 @@ class Facts:
     camera_failures: Mapping[str, int]
     frame_age_s: float
     ready: bool
+    pairs_refused: int = 0
 
 
 class Metrics:
@@ -61,6 +62,8 @@ class _Scrape(Collector):
         for camera, count in facts.camera_failures.items():
             failures.add_metric([camera], count)
         yield failures
+        yield CounterMetricFamily("binpick_pairs_refused", "Pairs refused: of no one instant, not whole, or not proved.",
+                                  facts.pairs_refused)
         yield GaugeMetricFamily("binpick_frame_age_seconds", "Since the last trigger that gave a pair.", facts.frame_age_s)
         yield GaugeMetricFamily("binpick_ready", "1 when a cycle would start now.", int(facts.ready))
 

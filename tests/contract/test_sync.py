@@ -66,8 +66,9 @@ def true_us(rig: GigeGroup, pair: StereoPair) -> float:
     return (right.started_ns - left.started_ns) / 1000
 
 
-@pytest.mark.parametrize(("sync", "apart"), [("line", False), ("scheduled_action", False), ("action", False), ("software", False),
-                                             ("line", True), ("action", True), ("software", True)])
+@pytest.mark.parametrize(("sync", "apart"), [
+    ("line", False), ("scheduled_action", False), ("action", False), ("software", False), ("line", True), ("action", True),
+    ("software", True)])
 def test_the_reported_skew_is_the_true_one(gige_addresses: tuple[str, str], sync: Sync, apart: bool) -> None:
     with cell(gige_addresses, apart=apart, sync=sync, skew_us=300.0) as (rig, group):
         rig.ptp.tune(1, Oscillator(-1_000_000_000, 50_000), time.time_ns())

@@ -10,7 +10,8 @@ def sample(text: str, name: str) -> float:
 
 
 def facts() -> Facts:
-    return Facts(refused=2, late=1, gate_stopped=4, camera_failures={"left": 3, "right": 0}, frame_age_s=1.5, ready=True)
+    return Facts(refused=2, late=1, gate_stopped=4, camera_failures={"left": 3, "right": 0}, frame_age_s=1.5, ready=True,
+                 pairs_refused=5)
 
 
 def test_counts_cycles_by_code_and_times_every_stage() -> None:
@@ -34,6 +35,7 @@ def test_asks_the_cell_at_every_scrape() -> None:
     assert sample(text, "binpick_late_total") == 1
     assert sample(text, "binpick_gate_stopped_total") == 4
     assert sample(text, 'binpick_camera_failures_total{camera="left"}') == 3
+    assert sample(text, "binpick_pairs_refused_total") == 5
     assert sample(text, "binpick_frame_age_seconds") == 1.5
     assert sample(text, "binpick_ready") == 1
     now[0] = Facts(refused=3, late=1, gate_stopped=4, camera_failures={}, frame_age_s=math.nan, ready=False)

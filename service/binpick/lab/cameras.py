@@ -3,6 +3,7 @@
 import time
 import tracemalloc
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,8 +13,8 @@ from rich.table import Table
 
 from binpick.camera import backends
 from binpick.camera.group import CameraGroup
-from binpick.data import Light, StereoPair
-from binpick.errors import PairRefused
+from binpick.data import Light
+from binpick.errors import CameraError, PairRefused
 from binpick.lab.rig import Plan, Rig, free
 from binpick.settings.cell import AravisCameras, CameraAddress, Sync
 
@@ -43,6 +44,27 @@ class Trial:
     offset_s: float = 0.78
     drift_ppm: float = 40.0
     packet_size: int | Literal["auto"] = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What a pair said; of its images only frame id and checksum."""
+
+    skew_us: float
+    sigma_us: float
+    proof: str
+    arrival_ms: float
+    resends: int
+    images: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A pair beside the truth. `whole`: every bit of both images is what was sent."""
+
+    taken: Taken
+    true_us: float
+    whole: bool
 
 
 def programme(pairs: int) -> list[Trial]:
@@ -83,24 +105,28 @@ def _series(trial: Trial, rig: Rig, group: CameraGroup) -> dict[str, Any]:
     if trial.loss:
         rig.lose(trial.loss, seed=7)
     before, busy_s = group.statuses()[0].refused, 0.0
-    kept: list[tuple[StereoPair, tuple[int, int]]] = []
-    failed = 0
+    judged: list[Judged] = []
+    taken: list[Taken] = []
+    lost = 0
     for _ in range(trial.pairs):
         busy_s -= time.process_time()
         try:
             pair = group.capture(LIGHT, _in(PATIENCE_S))
         except PairRefused:
-            failed += 1
+            continue
+        except CameraError:            # as the cell does; frames are counted from 1 again
+            lost, judged, taken = lost + 1, judged + _judge(taken, rig), []
+            group.open(_in(PATIENCE_S))
             continue
         finally:
             busy_s += time.process_time()
-        kept.append((pair, _checksums(pair)))
+        taken.append(Taken(pair.skew_us, pair.sigma_us, pair.proof, pair.arrival_ms, sum(f.resends for f in pair.frames),
+                           tuple((f.frame_id, zlib.crc32(f.image.tobytes())) for f in pair.frames)))
     rig.lose(0.0, seed=7)
     copies = _copies(group) if not (trial.loss or trial.skew_us) else float("nan")
-    truths = [rig.truth(index) for index in (0, 1)]
-    return {"name": trial.name, "sync": trial.sync, "pairs": trial.pairs, "failed": failed,
+    return {"name": trial.name, "sync": trial.sync, "pairs": trial.pairs, "lost": lost,
             "refused": group.statuses()[0].refused - before, "cpu_ms": round(busy_s * 1000 / trial.pairs, 2), "copies": copies,
-            **_judged(trial, kept, truths)}
+            **_figures(trial, judged + _judge(taken, rig))}
 
 
 def _settle(group: CameraGroup) -> None:
@@ -115,10 +141,6 @@ def _settle(group: CameraGroup) -> None:
             return
 
 
-def _checksums(pair: StereoPair) -> tuple[int, int]:
-    return zlib.crc32(pair.left.image.tobytes()), zlib.crc32(pair.right.image.tobytes())
-
-
 def _copies(group: CameraGroup) -> float:
     """How often an image's bytes are held at most while a pair is taken, beyond the driver's own buffers."""
     tracemalloc.start()
@@ -130,23 +152,25 @@ def _copies(group: CameraGroup) -> float:
     return round(peak / sum(frame.image.nbytes for frame in pair.frames), 2)
 
 
-def _judged(trial: Trial, kept: list[tuple[StereoPair, tuple[int, int]]], truths: list[dict[int, Any]]) -> dict[str, Any]:
-    errors, sigmas, arrivals, wrong, beyond = [], [], [], 0, 0
-    proofs: dict[str, int] = {}
-    for pair, checksums in kept:
-        left, right = (truth[frame.frame_id] for truth, frame in zip(truths, pair.frames, strict=True))
-        true_us = (right.started_ns - left.started_ns) / 1000
-        errors.append(pair.skew_us - true_us)
-        sigmas.append(pair.sigma_us)
-        arrivals.append(pair.arrival_ms)
-        wrong += checksums != (left.crc32, right.crc32)
-        beyond += abs(true_us) > trial.max_skew_us
-        proofs[pair.proof] = proofs.get(pair.proof, 0) + 1
-    error, sigma = np.abs(errors), np.array(sigmas)
-    return {"accepted": len(kept), "proofs": proofs, "within_3_sigma": float(np.mean(error <= 3 * sigma)) if kept else None,
-            "error_us": _quantiles(error), "sigma_us": _quantiles(sigma), "arrival_ms": _quantiles(arrivals),
-            "resends": sum(frame.resends for pair, _ in kept for frame in pair.frames),
-            "wrong_images": wrong, "accepted_beyond_limit": beyond}
+def _judge(taken: list[Taken], rig: Rig) -> list[Judged]:
+    truths = [rig.truth(index) for index in (0, 1)] if taken else []
+    found = []
+    for pair in taken:
+        left, right = (truth[block] for truth, (block, _) in zip(truths, pair.images, strict=True))
+        sent = (left.crc32, right.crc32)
+        found.append(Judged(pair, (right.started_ns - left.started_ns) / 1000, sent == tuple(crc for _, crc in pair.images)))
+    return found
+
+
+def _figures(trial: Trial, judged: list[Judged]) -> dict[str, Any]:
+    error = np.array([abs(shot.taken.skew_us - shot.true_us) for shot in judged])
+    sigma = np.array([shot.taken.sigma_us for shot in judged])
+    return {"accepted": len(judged), "proofs": dict(Counter(shot.taken.proof for shot in judged)),
+            "within_3_sigma": float(np.mean(error <= 3 * sigma)) if judged else None,
+            "error_us": _quantiles(error), "sigma_us": _quantiles(sigma),
+            "arrival_ms": _quantiles([shot.taken.arrival_ms for shot in judged]),
+            "resends": sum(shot.taken.resends for shot in judged), "wrong_images": sum(not shot.whole for shot in judged),
+            "accepted_beyond_limit": sum(abs(shot.true_us) > trial.max_skew_us for shot in judged)}
 
 
 def _quantiles(values: Sequence[float] | np.ndarray) -> dict[str, float] | None:
@@ -157,13 +181,13 @@ def _quantiles(values: Sequence[float] | np.ndarray) -> dict[str, float] | None:
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """Simulator figures, one row a series."""
-    sheet = Table("series", "pairs", "failed", "refused", "proof", "|error| µs p50/p95/max", "in 3σ", "σ µs p50/max",
+    sheet = Table("series", "accepted", "lost", "refused", "proof", "|error| µs p50/p95/max", "in 3σ", "σ µs p50/max",
                   "both here ms p50/p95", "CPU ms", "copies", "resends", "wrong", "beyond",
                   title="Camera pair on simulated cameras (simulator figures, not a camera's)")
     for row in rows:
         error, sigma, arrival = (row[name] or dict.fromkeys(("p50", "p95", "max"), float("nan"))
                                  for name in ("error_us", "sigma_us", "arrival_ms"))
-        sheet.add_row(row["name"], str(row["accepted"]), str(row["failed"]), str(row["refused"]),
+        sheet.add_row(row["name"], f"{row['accepted']} of {row['pairs']}", str(row["lost"]), str(row["refused"]),
                       " ".join(f"{name} {number}" for name, number in row["proofs"].items()),
                       f"{error['p50']:.1f} / {error['p95']:.1f} / {error['max']:.1f}",
                       "-" if row["within_3_sigma"] is None else f"{row['within_3_sigma']:.1%}",

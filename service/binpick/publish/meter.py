@@ -34,4 +34,5 @@ def facts(view: View) -> Facts:
         (time.monotonic_ns() - latest.triggered_ns) / NS_PER_S)
     return Facts(refused=counts.get("refused", 0), late=counts.get("late", 0), gate_stopped=counts.get("gate_stopped", 0),
                  frame_age_s=age_s, camera_failures={camera.name: camera.failures for camera in snapshot.cameras},
-                 ready=snapshot.phase == "ready")
+                 ready=snapshot.phase == "ready",
+                 pairs_refused=max((camera.refused for camera in snapshot.cameras), default=0))

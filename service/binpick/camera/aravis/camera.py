@@ -101,7 +101,7 @@ class AravisCamera:
         if driver is None:
             return self._status
         state, offset_ns = driver.ptp
-        return replace(self._status, ptp=state, ptp_offset_ns=offset_ns)
+        return replace(self._status, ptp=state, ptp_offset_us=round(offset_ns / 1000, 1))
 
     def _opened(self) -> Driver:
         if self._driver is None:

@@ -26,6 +26,8 @@ from binpick.settings.cell import PixelFormat
 
 PROJECTOR_LINE = "Line2"
 """The Alvium's opto-isolated output."""
+IDLE_NS = 5_000_000
+"""So long nothing is asked of it before its clock is looked at: between the shots of one cycle a trigger would have to wait."""
 EXPOSURE_TOLERANCE = 0.01
 """Cameras round the exposure to their row's time."""
 GAIN_TOLERANCE_DB = 0.1
@@ -56,7 +58,7 @@ class Driver:
         self._time: Timekeeper | None = None
         self._exposure_us = self._gain_db = 0.0
         self._triggered_ns = self._acknowledged_ns = 0
-        self._waiting = False
+        self._waiting, self._idle_ns = False, 0
         self.clock = DeviceClock()
         self.ptp = ("", 0.0)
 
@@ -117,7 +119,9 @@ class Driver:
     @property
     def due_ns(self) -> MonotonicNs | None:
         """When its clock is to be looked at again; None while an image is waited for, or it is not open."""
-        return self._time.due_ns if self._time is not None and not self._waiting else None
+        if self._time is None or self._waiting:
+            return None
+        return max(self._time.due_ns, self._idle_ns + IDLE_NS)
 
     def rest(self) -> None:
         """Looks at its clock."""
@@ -138,6 +142,7 @@ class Driver:
                 camera.set_string("LineSelector", PROJECTOR_LINE)
                 camera.set_string("LineSource", "ExposureActive" if light.projector else "Off")
         self._stream.expect(self._exposure_us)
+        self._idle_ns = time.monotonic_ns()
 
     def arm(self) -> None:
         """Something else will start an exposure. Raises CameraLost."""
@@ -172,7 +177,7 @@ class Driver:
         try:
             buffer = self._stream.pop(deadline_ns)
         finally:
-            self._waiting = False
+            self._waiting, self._idle_ns = False, time.monotonic_ns()
         try:
             frame = self._frame(buffer, sequence)
         finally:

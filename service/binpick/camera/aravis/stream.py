@@ -1,6 +1,7 @@
 """A camera's images through Aravis: buffers, resends, and frames counted against triggers; on the camera's own thread."""
 
 import contextlib
+import logging
 import os
 import socket
 from pathlib import Path
@@ -31,6 +32,9 @@ BLOCK_IDS = 0xFFFF
 """GigE Vision 1 counts frames 1 to 65535 and again."""
 
 
+log = logging.getLogger(__name__)
+
+
 class Stream:
     """The stream of one open Aravis.Camera, acquisition running until its end: block ids would start again.
 
@@ -51,8 +55,11 @@ class Stream:
         stream.set_property("packet-timeout", PACKET_TIMEOUT_US)
         stream.set_property("packet-request-ratio", REQUEST_RATIO)
         self.expect(0.0)
-        _enlarge_socket_buffer(stream.get_port())
         payload = camera.get_payload()
+        granted = _enlarge_socket_buffer(stream.get_port())
+        if granted < payload:
+            log.warning("camera %s: the socket's buffer holds %d bytes, an image has %d: raise net.core.rmem_max", name,
+                        granted, payload)
         for _ in range(BUFFERS):
             stream.push_buffer(aravis.Buffer.new_allocate(payload))
         camera.start_acquisition()
@@ -147,8 +154,10 @@ class Stream:
         return int(self._stream.get_info_uint64_by_name(name))
 
 
-def _enlarge_socket_buffer(port: int) -> None:
-    """Sets the stream socket's buffer now; Aravis would only do so inside the first frame, and lose it."""
+def _enlarge_socket_buffer(port: int) -> int:
+    """Sets the stream socket's buffer now, and returns what the kernel grants; Aravis would only do so inside the first frame,
+    and lose it."""
+    granted = 0
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):            # not a socket, or closed by another thread meanwhile
             if not str(entry.readlink()).startswith("socket:"):
@@ -156,3 +165,5 @@ def _enlarge_socket_buffer(port: int) -> None:
             with socket.socket(fileno=os.dup(int(entry.name))) as twin:
                 if twin.type == socket.SOCK_DGRAM and twin.family == socket.AF_INET and twin.getsockname()[1] == port:
                     twin.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
+                    granted = twin.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2       # the kernel counts double
+    return granted

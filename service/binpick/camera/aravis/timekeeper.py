@@ -14,6 +14,8 @@ FIRST_LATCHES = 8
 """At opening, so that the first pair can be proved."""
 PERIOD_NS = 250_000_000
 """Between two latches of an idle camera: ten in it take the drift to 1 ppm."""
+OFFSET_NS = 1_000_000_000
+"""Between two looks at the offset from the master: every command may be lost, and costs half a second then."""
 PATIENCE_NS = 10_000_000_000
 """So long PTP may take to find its place before it is switched off and on again; Alviums need some seconds."""
 
@@ -28,6 +30,7 @@ class Timekeeper:
         self.ptp = ""
         self.ptp_offset_ns = 0.0
         self._lost_ns: MonotonicNs = time.monotonic_ns()
+        self._offset_read_ns: MonotonicNs = 0
         self.due_ns: MonotonicNs = 0
         self._latch = next((names for names in LATCHES if all(map(features.has, names))), None)
         self._tick_ns = 1.0
@@ -39,10 +42,10 @@ class Timekeeper:
         for _ in range(FIRST_LATCHES):
             self.latch()
         self.observe()
+        self.due_ns = time.monotonic_ns() + PERIOD_NS
 
     def latch(self) -> None:
         """One round trip, and one to read what was latched."""
-        self.due_ns = time.monotonic_ns() + PERIOD_NS
         if self._latch is None:
             return
         command, value = self._latch
@@ -60,14 +63,20 @@ class Timekeeper:
         if self.ptp != was:
             self.clock = DeviceClock()
             self.latch()
-        if self.ptp in SYNCHRONISED and self._features.has("PtpOffsetFromMaster"):
+        if self.ptp in SYNCHRONISED and (self.ptp != was or time.monotonic_ns() - self._offset_read_ns > OFFSET_NS):
+            self._read_offset()
+        return self.ptp != was
+
+    def _read_offset(self) -> None:
+        self._offset_read_ns = time.monotonic_ns()
+        if self._features.has("PtpOffsetFromMaster"):
             if self._features.has("PtpDataSetLatch"):
                 self._camera.execute_command("PtpDataSetLatch")
             self.ptp_offset_ns = float(self._camera.get_integer("PtpOffsetFromMaster"))
-        return self.ptp != was
 
     def rest(self) -> None:
         """What an idle camera's thread does: a latch, a look at PTP, and a new start for a PTP that got stuck."""
+        self.due_ns = time.monotonic_ns() + PERIOD_NS
         self.latch()
         self.observe()
         now_ns = time.monotonic_ns()
