@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from binpick.camera import backends
-from binpick.camera.aravis import AravisCamera, Setup
+from binpick.camera import backends, starter
+from binpick.camera.aravis import AravisCamera, Setup, timekeeper
 from binpick.camera.group import CameraGroup
 from binpick.camera.sync import Step
 from binpick.data import Image, Light, StereoPair
@@ -112,6 +112,31 @@ def test_ptp_that_falls_back_costs_the_proof_and_no_pair(gige_addresses: tuple[s
             assert abs(pair.skew_us - true_us(rig, pair)) <= 3 * pair.sigma_us
         rig.ptp.force(1, "", time.time_ns())
         proved(group, "ptp")
+
+
+def test_a_ptp_that_got_stuck_is_started_anew(gige_addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timekeeper, "PATIENCE_NS", 300_000_000)
+    with cell(gige_addresses) as (rig, group):
+        proved(group, "ptp")
+        rig.ptp.enable(1, False, time.time_ns())          # though the camera's feature still says that it is on
+        proved(group, "latch")
+        until = time.monotonic() + 10
+        while [status.ptp for status in group.statuses()] != ["Master", "Slave"]:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        proved(group, "ptp")
+
+
+def test_an_action_that_comes_late_is_refused_and_costs_no_camera(gige_addresses: tuple[str, str],
+                                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    with cell(gige_addresses, sync="scheduled_action") as (_, group):
+        proved(group, "ptp")
+        monkeypatch.setattr(starter, "LEAD_NS", -50_000_000)
+        with pytest.raises(PairRefused, match="camera left did not take the action command: it came late"):
+            capture(group)
+        monkeypatch.undo()
+        assert capture(group).proof == "ptp"
+        assert [(status.connected, status.failures) for status in group.statuses()] == [(True, 0)] * 2
 
 
 def test_a_missing_wire_is_named(gige_addresses: tuple[str, str]) -> None:

@@ -19,16 +19,11 @@ def port_of(address: str) -> str:
 
 def sharing(address: str, others: Sequence[str]) -> int:
     """How many cameras send through the port that this one hangs on, itself included; on the loopback there is no wire."""
-    if not address or ipaddress.ip_address(address).is_loopback:
-        return 1
-    return 1 + sum(1 for other in others if other and _same_port(address, other))
-
-
-def _same_port(address: str, other: str) -> bool:
     try:
-        return port_of(address) == port_of(other)
-    except OSError:
-        return False
+        ports = [port_of(place) for place in (address, *others) if place]
+    except OSError:           # one of them is nowhere: it sends nothing either
+        return 1
+    return 1 if ipaddress.ip_address(ports[0]).is_loopback else ports.count(ports[0])
 
 
 def packet_delay_ns(packet_size: int, cameras: int, link_bytes_per_s: int = GIGABIT) -> int:

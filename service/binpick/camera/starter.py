@@ -49,6 +49,9 @@ class Starter:
                 return "the cameras' time is not known yet"
             at_ns = max(times)
         names = {camera.status().address: camera.name for camera in cameras}
-        said = action.broadcast(Action(self.device_key, at_ns=at_ns), (next(_numbers) - 1) % 0xFFFF + 1, tuple(names))
+        try:
+            said = action.broadcast(Action(self.device_key, at_ns=at_ns), (next(_numbers) - 1) % 0xFFFF + 1, tuple(names))
+        except OSError as error:
+            return f"the action command cannot be sent ({error.strerror or error}): check this host's network"
         return "; ".join(f"camera {names[address]} did not take the action command: {why}"
                          for address, why in said.items() if why)
