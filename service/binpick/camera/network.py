@@ -18,12 +18,21 @@ def port_of(address: str) -> str:
 
 
 def sharing(address: str, others: Sequence[str]) -> int:
-    """How many cameras send through the port that this one hangs on, itself included; on the loopback there is no wire."""
-    try:
-        ports = [port_of(place) for place in (address, *others) if place]
-    except OSError:           # one of them is nowhere: it sends nothing either
+    """How many cameras send through the port that this one hangs on, itself included; on the loopback there is no wire.
+
+    An empty address is of a camera that is not found yet: it may hang there as well. Raises OSError.
+    """
+    port = port_of(address)
+    if ipaddress.ip_address(port).is_loopback:
         return 1
-    return 1 if ipaddress.ip_address(ports[0]).is_loopback else ports.count(ports[0])
+    return 1 + sum(not other or _hangs_on(port, other) for other in others)
+
+
+def _hangs_on(port: str, address: str) -> bool:
+    try:
+        return port_of(address) == port
+    except OSError:           # it is nowhere
+        return False
 
 
 def packet_delay_ns(packet_size: int, cameras: int, link_bytes_per_s: int = GIGABIT) -> int:

@@ -10,6 +10,7 @@ from binpick.camera.proof import SYNCHRONISED
 
 LATCHES = (("TimestampLatch", "TimestampLatchValue"), ("GevTimestampControlLatch", "GevTimestampValue"))
 """Command and value, in ns and in ticks: SFNC's, and the bootstrap registers of GigE Vision 1."""
+NS_PER_S = 1_000_000_000
 FIRST_LATCHES = 8
 """At opening, so that the first pair can be proved."""
 PERIOD_NS = 250_000_000
@@ -33,9 +34,9 @@ class Timekeeper:
         self._offset_read_ns: MonotonicNs = 0
         self.due_ns: MonotonicNs = 0
         self._latch = next((names for names in LATCHES if all(map(features.has, names))), None)
-        self._tick_ns = 1.0
+        self._ticks_per_s = NS_PER_S
         if self._latch == LATCHES[1] and features.has("GevTimestampTickFrequency"):
-            self._tick_ns = 1e9 / (camera.get_integer("GevTimestampTickFrequency") or 1e9)
+            self._ticks_per_s = int(camera.get_integer("GevTimestampTickFrequency")) or NS_PER_S
 
     def begin(self) -> None:
         """The first comparisons. Raises GLib.Error, like all others."""
@@ -52,7 +53,7 @@ class Timekeeper:
         sent_ns = time.monotonic_ns()
         self._camera.execute_command(command)
         acknowledged_ns = time.monotonic_ns()
-        device_ns = int(self._camera.get_integer(value) * self._tick_ns)
+        device_ns = int(self._camera.get_integer(value)) * NS_PER_S // self._ticks_per_s
         self.clock = self.clock.after(Latch(sent_ns, device_ns, acknowledged_ns))
 
     def observe(self) -> bool:
