@@ -24,6 +24,7 @@ SMALL = (640, 400)
 LIMIT_US = 1000.0
 """max_skew_us of the series with injected skews: below it pairs are accepted, above it never."""
 PATIENCE_S = 20.0
+OPEN_S = 5.0
 MODES: tuple[Sync, ...] = ("line", "scheduled_action", "action", "software")
 SKEWS_US = (0.0, 50.0, 500.0, 5000.0)
 LOSSES = (0.01, 0.05, 0.20)
@@ -87,7 +88,7 @@ def run(trials: Sequence[Trial]) -> Iterator[dict[str, Any]]:
                                 packet_size=trial.packet_size)
         with Rig(plan) as rig:
             group = backends.group(cameras)
-            group.open(_in(PATIENCE_S))
+            _open(group)
             try:
                 yield _series(trial, rig, group)
             finally:
@@ -116,7 +117,7 @@ def _series(trial: Trial, rig: Rig, group: CameraGroup) -> dict[str, Any]:
             continue
         except CameraError:            # as the cell does; frames are counted from 1 again
             lost, judged, taken = lost + 1, judged + _judge(taken, rig), []
-            group.open(_in(PATIENCE_S))
+            _open(group)
             continue
         finally:
             busy_s += time.process_time()
@@ -127,6 +128,20 @@ def _series(trial: Trial, rig: Rig, group: CameraGroup) -> dict[str, Any]:
     return {"name": trial.name, "sync": trial.sync, "pairs": trial.pairs, "lost": lost,
             "refused": group.statuses()[0].refused - before, "cpu_ms": round(busy_s * 1000 / trial.pairs, 2), "copies": copies,
             **_figures(trial, judged + _judge(taken, rig))}
+
+
+def _open(group: CameraGroup) -> None:
+    """As often as it takes. Raises CameraError after PATIENCE_S."""
+    until_ns = _in(PATIENCE_S)
+    while True:
+        try:
+            group.open(_in(OPEN_S))
+        except CameraError:
+            if time.monotonic_ns() > until_ns:
+                raise
+            time.sleep(0.2)
+        else:
+            return
 
 
 def _settle(group: CameraGroup) -> None:
