@@ -25,7 +25,8 @@ from binpick.result import (
     failure,
 )
 
-CAMERAS = tuple(CameraStatus(name, True, "Alvium G1-240m", f"SN{name}", "169.254.1.2") for name in ("left", "right"))
+CAMERAS = tuple(CameraStatus(name, True, "Alvium G1-240m", f"SN{name}", "169.254.1.2", ptp="Slave", ptp_offset_us=-0.2)
+                for name in ("left", "right"))
 PANELS = (panels.result, panels.grasps, panels.funnel, panels.timings, panels.cameras, panels.counts)
 
 

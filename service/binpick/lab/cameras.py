@@ -124,7 +124,7 @@ def _series(trial: Trial, rig: Rig, group: CameraGroup) -> dict[str, Any]:
         taken.append(Taken(pair.skew_us, pair.sigma_us, pair.proof, pair.arrival_ms, sum(f.resends for f in pair.frames),
                            tuple((f.frame_id, zlib.crc32(f.image.tobytes())) for f in pair.frames)))
     rig.lose(0.0, seed=7)
-    copies = _copies(group) if not (trial.loss or trial.skew_us) else float("nan")
+    copies = _copies(group) if trial.size_px == FULL and not trial.loss else None
     return {"name": trial.name, "sync": trial.sync, "pairs": trial.pairs, "lost": lost,
             "refused": group.statuses()[0].refused - before, "cpu_ms": round(busy_s * 1000 / trial.pairs, 2), "copies": copies,
             **_figures(trial, judged + _judge(taken, rig))}
@@ -207,6 +207,6 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
                       f"{error['p50']:.1f} / {error['p95']:.1f} / {error['max']:.1f}",
                       "-" if row["within_3_sigma"] is None else f"{row['within_3_sigma']:.1%}",
                       f"{sigma['p50']:.1f} / {sigma['max']:.1f}", f"{arrival['p50']:.1f} / {arrival['p95']:.1f}",
-                      f"{row['cpu_ms']:.1f}", f"{row['copies']:.2f}", str(row["resends"]), str(row["wrong_images"]),
+                      f"{row['cpu_ms']:.1f}", "-" if row["copies"] is None else f"{row['copies']:.2f}", str(row["resends"]), str(row["wrong_images"]),
                       str(row["accepted_beyond_limit"]))
     return sheet

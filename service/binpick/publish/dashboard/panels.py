@@ -100,6 +100,8 @@ def _camera(status: CameraStatus) -> str:
     tone = "good" if status.connected and not status.error else "bad"
     device = " ".join(part for part in (status.model, status.serial, status.address) if part)
     lost = f"{status.frames} frames · {status.resends} resends · {status.failures} failures"
+    if status.ptp:
+        lost += f" · PTP {escape(status.ptp)} {status.ptp_offset_us:+.1f} µs"
     wrong = f'<p class="wrong">{escape(status.error)}</p>' if status.error else ""
     return (f'<div class="camera {tone}"><b>{escape(status.name)}</b><small>{escape(device)}</small><small>{lost}</small>'
             f"{wrong}</div>")
