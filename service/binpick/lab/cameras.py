@@ -207,6 +207,6 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
                       f"{error['p50']:.1f} / {error['p95']:.1f} / {error['max']:.1f}",
                       "-" if row["within_3_sigma"] is None else f"{row['within_3_sigma']:.1%}",
                       f"{sigma['p50']:.1f} / {sigma['max']:.1f}", f"{arrival['p50']:.1f} / {arrival['p95']:.1f}",
-                      f"{row['cpu_ms']:.1f}", "-" if row["copies"] is None else f"{row['copies']:.2f}", str(row["resends"]), str(row["wrong_images"]),
-                      str(row["accepted_beyond_limit"]))
+                      f"{row['cpu_ms']:.1f}", "-" if row["copies"] is None else f"{row['copies']:.2f}", str(row["resends"]),
+                      str(row["wrong_images"]), str(row["accepted_beyond_limit"]))
     return sheet
