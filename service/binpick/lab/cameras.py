@@ -13,7 +13,7 @@ from rich.table import Table
 
 from binpick.camera import backends
 from binpick.camera.group import CameraGroup
-from binpick.data import Light
+from binpick.data import Light, StereoPair
 from binpick.errors import CameraError, PairRefused
 from binpick.lab.rig import Plan, Rig, free
 from binpick.settings.cell import AravisCameras, CameraAddress, Sync
@@ -144,14 +144,22 @@ def _open(group: CameraGroup) -> None:
             return
 
 
+def _pair(group: CameraGroup) -> StereoPair:
+    """One pair that is not counted, as soon as there is one."""
+    while True:
+        try:
+            return group.capture(LIGHT, _in(PATIENCE_S))
+        except PairRefused:
+            continue
+        except CameraError:
+            _open(group)
+
+
 def _settle(group: CameraGroup) -> None:
     """First pairs until PTP has found its place."""
     until = time.monotonic() + 3
     while time.monotonic() < until:
-        try:
-            pair = group.capture(LIGHT, _in(PATIENCE_S))
-        except PairRefused:
-            continue
+        pair = _pair(group)
         if pair.proof == "ptp" or [status.ptp for status in group.statuses()] == ["Master", "Master"]:
             return
 
@@ -160,7 +168,7 @@ def _copies(group: CameraGroup) -> float:
     """How often an image's bytes are held at most while a pair is taken, beyond the driver's own buffers."""
     tracemalloc.start()
     try:
-        pair = group.capture(LIGHT, _in(PATIENCE_S))
+        pair = _pair(group)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
