@@ -10,6 +10,7 @@ import pytest
 
 from binpick.camera.base import Clock, MonotonicNs
 from binpick.camera.group import CameraGroup
+from binpick.camera.starter import Starter
 from binpick.data import CameraStatus, Frame, Image, Light
 from binpick.errors import CameraError, CameraLost, CycleTimeout, PairRefused
 from binpick.sim.camera import SimCamera
@@ -251,6 +252,47 @@ def test_a_camera_that_still_exposes_for_a_broken_shot_is_waited_for() -> None:
     group.open(within(1))
     pair = group.capture(LIGHT, within(2))
     assert (pair.left.sequence, pair.right.sequence) == (2, 2)
+
+
+def test_a_camera_that_the_dead_one_should_have_started_is_not_blamed() -> None:
+    class Dying(Odd):
+        """Takes no first trigger; the last one that it took is `shot`."""
+
+        shot = 0
+
+        def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+            if self.opened == 1:
+                raise CameraLost("left is gone", "left")
+            super().trigger(sequence, deadline_ns)
+            self.shot = sequence
+
+    class Wired(Odd):
+        """Exposes when the left camera does."""
+
+        armed = 0
+
+        def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:
+            assert not self.armed
+            self.armed = sequence
+
+        def disarm(self, deadline_ns: MonotonicNs) -> None:
+            self.armed = 0
+
+        def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
+            if left.shot != sequence:
+                raise CameraLost("right sent no image", "right")
+            self.trigger(self.armed, deadline_ns)
+            self.armed = 0
+            return super().grab(sequence, deadline_ns)
+
+    left, right = Dying(0), Wired(1)
+    group = CameraGroup((left, right), 1e6, starter=Starter("line"))
+    group.open(within(1))
+    with pytest.raises(CameraLost, match="left is gone"):
+        group.capture(LIGHT, within(2))
+    group.open(within(1))
+    assert group.capture(LIGHT, within(2)).right.sequence == 2
+    assert (left.opened, right.opened) == (2, 1)
 
 
 def test_a_deadline_within_the_exposure_is_no_fault_of_the_cameras() -> None:

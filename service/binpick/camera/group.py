@@ -120,12 +120,25 @@ class CameraGroup:
             verb(self._sequence, self._answer_by(patience_ns))
             self._due[index] = self._clock() + int(light.exposure_us * 1000) + IMAGE_NS
 
-        self._each(begin, self._starter.order(len(self._cameras)))
+        try:
+            self._each(begin, self._starter.order(len(self._cameras)))
+        except CameraError:
+            with contextlib.suppress(CameraError):       # named by its own next verb
+                self._call_off(patience_ns)
+            raise
         if why := self._starter.fire(self._cameras, self._clock):
-            self._each(lambda _, camera: camera.disarm(self._answer_by(patience_ns)))
-            self._due = [None] * len(self._cameras)
+            self._call_off(patience_ns)
             time.sleep(light.exposure_us / 1e6 + SETTLE_S)
             raise PairRefused(why)
+
+    def _call_off(self, patience_ns: int) -> None:
+        """What should have started the other cameras failed: they are not waited for."""
+        def spare(index: int, camera: Camera) -> None:
+            if self._open[index] and self._starter.follows(index):
+                self._due[index] = None
+                camera.disarm(self._answer_by(patience_ns))
+
+        self._each(spare)
 
     def _judge(self, frames: tuple[Frame, ...]) -> Skew:
         """The worst skew among them. Raises PairRefused when it may be beyond the limit."""
