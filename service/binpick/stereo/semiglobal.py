@@ -68,7 +68,8 @@ def of_right(left: Image, right: Image, num_disparities: int, matcher: Sgbm) -> 
                   False)
 
 
-def _match(image: Image, other: UInt8[np.ndarray, "h other_w"], disparities: int, matcher: Sgbm, unique_percent: int, checked: bool) -> Found:
+def _match(image: Image, other: UInt8[np.ndarray, "h other_w"], disparities: int, matcher: Sgbm, unique_percent: int,
+           checked: bool) -> Found:
     """Disparities of an image whose pixels are found in the other one at x + disparity, wherever that one reaches so far."""
     rows, width = image.shape[0], other.shape[1] - disparities
     found = np.empty((rows, width), np.int16)
