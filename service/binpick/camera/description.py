@@ -35,6 +35,11 @@ class Feature:
     trouble: str = ""
 
     @property
+    def shown(self) -> str:
+        """The value with its unit, or why there is none."""
+        return f"({self.trouble})" if self.trouble else f"{self.value} {self.unit}".strip()
+
+    @property
     def range(self) -> str:
         """What may be written, in one line; empty for what is only read."""
         if not self.access.startswith("RW"):
@@ -51,7 +56,7 @@ class Description:
     """Everything that can be read of one camera."""
 
     address: str
-    genicam_xml: str = field(repr=False)
+    genicam_xml: bytes = field(repr=False)
     features: tuple[Feature, ...]
     controlled: bool
     """By another program, at that moment."""

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from binpick.host import Host
 
 cameras = typer.Typer(name="cameras", no_args_is_help=True,
-                      help="Which cameras answer, and what they say of themselves. Changes nothing; also while the daemon runs.")
+                      help="Which cameras answer, and what they say of themselves. Changes nothing, and disturbs no daemon.")
 Address = Annotated[str, typer.Argument(help="IPv4 address of a camera; left out: every camera that answers a broadcast.")]
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "open3d-cpu", "open3d", "scipy", "pydantic", "pymodbus")
-NOBODY = ("no camera answers a broadcast: check its power (PoE, or the plug) and its cable, that this host's port has an address "
+NOBODY = ("no camera answers a broadcast: check its power (PoE, or the plug) and cable, that this host's port has an address "
           "in the camera's subnet (cameras without one of their own use 169.254.0.0/16), and the firewall; "
           "`binpick check --host --cell FILE` looks at these")
 
@@ -69,7 +69,8 @@ def dump(address: Address = "",
     addresses = _addresses(address)
     path = out or Path(f"binpick-cameras-{datetime.now(UTC):%Y%m%d-%H%M%S}.zip")
     here = host.look()
-    files = {"host.json": json.dumps(asdict(here), indent=1), "versions.json": json.dumps(_versions(), indent=1)}
+    files: dict[str, str | bytes] = {"host.json": json.dumps(asdict(here), indent=1),
+                                     "versions.json": json.dumps(_versions(), indent=1)}
     failed: list[str] = []
     for number, one in enumerate(addresses, start=1):
         typer.echo(f"{number} of {len(addresses)}: reading {one} ...", err=True)
@@ -129,8 +130,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def _table(features: "Iterable[Feature]") -> Iterator[str]:
-    rows = [(feature.name, feature.access, f"({feature.trouble})" if feature.trouble else f"{feature.value} {feature.unit}".strip(),
-             feature.range) for feature in features]
+    rows = [(feature.name, feature.access, feature.shown, feature.range) for feature in features]
     return _aligned([("feature", "access", "value", "may be"), *rows])
 
 
@@ -151,7 +151,7 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _files(description: "Description") -> dict[str, str]:
+def _files(description: "Description") -> dict[str, str | bytes]:
     folder, facts = description.address, asdict(description)
     del facts["genicam_xml"]
     return {f"{folder}/genicam.xml": description.genicam_xml,
@@ -159,13 +159,13 @@ def _files(description: "Description") -> dict[str, str]:
             f"{folder}/features.json": json.dumps(facts, indent=1)}
 
 
-def _zip(path: Path, files: dict[str, str]) -> None:
+def _zip(path: Path, files: dict[str, str | bytes]) -> None:
     """Raises InputError when it cannot be written."""
     import zipfile
 
     try:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, text in files.items():
-                archive.writestr(f"{path.stem}/{name}", text)
+            for name, content in files.items():
+                archive.writestr(f"{path.stem}/{name}", content)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

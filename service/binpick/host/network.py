@@ -145,6 +145,6 @@ def _ptp(host: Host, ports: Sequence[str]) -> Iterator[Finding]:
         return
     served = " ".join(f"-i {port}" for port in ports)
     yield Finding("PTP", "warn", f"no ptp4l on {' and '.join(missing)}", "each camera is master of its own clock, and their "
-                  "time stamps cannot be compared: pairs may be refused as exposed too far apart; the command runs until Ctrl-C, "
+                  "time stamps cannot be compared: pairs may be refused as exposed far apart; the command runs until Ctrl-C, "
                   "with the kernel's time stamps (-S)",
                   f"sudo apt-get install -y linuxptp && sudo ptp4l -S -m {served} --priority1=1")
