@@ -50,6 +50,13 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.fixture
+def discoverable(gige: GigePair) -> None:
+    """They answer broadcasts a moment after they answer their address."""
+    serials = {identity.serial for identity in gige.identities}
+    assert any(serials <= {found.serial for found in backends.discover()} for _ in range(5))
+
+
+@pytest.fixture
 def held(gige: GigePair) -> Iterator[None]:
     """The left camera, controlled by somebody else."""
     left, right = (CameraAddress(address=identity.address) for identity in gige.identities)
@@ -60,7 +67,7 @@ def held(gige: GigePair) -> Iterator[None]:
 
 
 @pytest.mark.gige
-def test_list_tells_where_each_camera_is_and_who_controls_it(gige: GigePair, held: None, call: Call) -> None:
+def test_list_tells_where_a_camera_is_and_who_controls_it(gige: GigePair, discoverable: None, held: None, call: Call) -> None:
     code, out, _ = call("cameras", "list", "--json")
     rows = {row["serial"]: row for row in json.loads(out)}       # of others too, that run on this machine
     left, right = (rows[identity.serial] for identity in gige.identities)
@@ -111,7 +118,9 @@ def test_dump_is_one_file_with_all_that_is_asked_for(gige: GigePair, call: Call,
     assert set(texts) == {"host.json", "versions.json", *(f"{address}/{name}" for name in ("genicam.xml", "values.txt",
                                                                                           "features.json"))}
     assert ElementTree.fromstring(texts[f"{address}/genicam.xml"]).tag.endswith("RegisterDescription")     # whole, no more
-    features = {feature["name"]: feature for feature in json.loads(texts[f"{address}/features.json"])["features"]}
+    facts = json.loads(texts[f"{address}/features.json"])
+    assert facts["registers"]["0x0938"] == f"{3000:#010x}"      # the heartbeat timeout
+    features = {feature["name"]: feature for feature in facts["features"]}
     assert features["ExposureTime"] == {
         "name": "ExposureTime", "category": "AcquisitionControl", "kind": "Float", "access": "RW", "value": "5000",
         "unit": "us", "minimum": "20", "maximum": "10000000", "step": "", "entries": [], "trouble": ""}
@@ -163,8 +172,8 @@ def test_a_camera_that_dies_while_it_is_read_is_lost_in_time(gige: GigePair, mon
 
 
 @pytest.mark.gige
-def test_check_looks_at_the_host_alone_and_finds_a_camera_by_its_serial_number(gige: GigePair, call: Call,
-                                                                               tmp_path: Path) -> None:
+def test_check_looks_at_the_host_alone_and_finds_a_camera_by_its_serial_number(gige: GigePair, discoverable: None,
+                                                                               call: Call, tmp_path: Path) -> None:
     left, right = gige.identities
     (tmp_path / "cell.yaml").write_text(CELL.format(f"serial: {left.serial}", f"address: {right.address}"))
     code, out, _ = call("check", "--host", "--json", "--cell", str(tmp_path / "cell.yaml"))

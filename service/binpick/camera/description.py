@@ -58,6 +58,8 @@ class Description:
     address: str
     genicam_xml: bytes = field(repr=False)
     features: tuple[Feature, ...]
+    registers: dict[str, str]
+    """GigE Vision's own, address and content in hexadecimal."""
     controlled: bool
     """By another program, at that moment."""
 

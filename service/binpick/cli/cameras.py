@@ -51,8 +51,9 @@ def values(address: Address = "",
     except re.error as error:
         raise InputError(f"--grep {grep!r} is no regular expression: {error}") from error
     for description in _described(_addresses(address)):
-        typer.echo(f"{description.value('DeviceModelName')} {description.value('DeviceSerialNumber')} at {description.address}"
-                   f"{', controlled by another program' if description.controlled else ''}".lstrip())
+        who = (description.value("DeviceModelName"), description.value("DeviceSerialNumber"), f"at {description.address}")
+        held = ", controlled by another program" if description.controlled else ""
+        typer.echo(" ".join(word for word in who if word) + held)
         typer.echo("\n".join(_table(feature for feature in description.features if wanted.search(feature.name))) + "\n")
 
 

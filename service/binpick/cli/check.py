@@ -80,7 +80,7 @@ def findings(path: Path) -> Iterator[Finding]:
     cameras = app.cameras(cell)
     try:
         opened = _tried("cameras", partial(_open, cell, cameras))
-        yield opened
+        yield opened._replace(command=f"binpick check --host --cell {path}" if opened.exit_code == 3 else "")
         if not opened.fault:
             yield _tried("a pair of images", partial(_capture, cell, rig, cameras))
     finally:

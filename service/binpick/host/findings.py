@@ -56,8 +56,9 @@ def _backlog(host: Host) -> Iterator[Finding]:
 def _firewall(host: Host, addresses: Sequence[str]) -> Iterator[Finding]:
     what = "firewall"
     if host.firewall is None:
-        yield Finding(what, "unknown", "its rules are shown to root alone", "cameras send UDP to ports that change: it must "
-                      "let in what comes from them; this shows it", "sudo nft list ruleset || sudo iptables -S")
+        yield Finding(what, "unknown", "root alone can read its rules, with nft or iptables",
+                      "cameras send UDP to ports that change: it must let in what comes from them; this shows it",
+                      "sudo nft list ruleset || sudo iptables -S")
     elif not host.firewall:
         yield Finding(what, "ok", "nothing drops packets by policy")
     else:

@@ -26,7 +26,7 @@ INPUT_CHAIN = re.compile(r"type filter hook input [^\n]*policy drop")
 
 
 def look() -> Host:
-    """This machine now. Reads only, and needs no rights; a firewall's rules are shown to root alone, else it stays None."""
+    """This machine now. Reads only, and needs no rights; a firewall's rules are shown to root alone, else that stays None."""
     seen = read()
     ports = tuple(replace(port, rx_ring=ring(port.name)) for port in seen.ports)
     return replace(seen, ports=ports, synchronised=_synchronised(), firewall=_firewall())
@@ -62,7 +62,7 @@ def _firewall() -> str | None:
     for tool, rules in asked.items():
         if rules is not None and (found := _dropping(tool, rules)):
             return found
-    return None if asked and all(rules is None for rules in asked.values()) else ""
+    return "" if any(rules is not None for rules in asked.values()) else None
 
 
 def _dropping(tool: str, rules: str) -> str:

@@ -1,5 +1,6 @@
 """Finds cameras and reads all that they say, without keeping hold of one: a daemon may take it the next moment."""
 
+import contextlib
 import ctypes
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,6 +11,11 @@ from binpick.camera.description import Description, Feature, Found
 from binpick.errors import CameraLost, CameraNotFound
 
 SHARED_LIBRARY = "libaravis-0.8.so.0"
+NO_LIMIT = 1e300
+"""Aravis' word for a limit that the description leaves out is the largest float, for a step the smallest."""
+BOOTSTRAP = (0x0000, 0x0004, 0x0010, 0x0014, 0x0904, 0x0934, 0x0938, 0x093C, 0x0940, 0x0950, 0x0954, 0x0958, 0x0A00, 0x0A14,
+             0x0D00, 0x0D04, 0x0D08, 0x0D20)
+"""Registers that every GigE Vision camera has or may have, and no GenICam feature need show: 0x0934 tells its capabilities."""
 
 
 def version() -> str:
@@ -56,10 +62,16 @@ def describe(address: str) -> Description:
         if mine:
             device.leave_control()
         features = tuple(_features(aravis, glib, device.get_genicam()))
-        return Description(address, _genicam_xml(device), features, controlled=not mine)
+        return Description(address, _genicam_xml(device), features, dict(_registers(glib, device)), controlled=not mine)
     except glib.Error as error:
         raise CameraLost(f"the camera at {address} stopped answering ({error.message}): check its power, cable and "
                          "network") from None
+
+
+def _registers(glib: Any, device: Any) -> Iterator[tuple[str, str]]:
+    for address in BOOTSTRAP:
+        with contextlib.suppress(glib.Error):        # an optional one
+            yield f"{address:#06x}", f"{device.read_register(address):#010x}"
 
 
 def _features(aravis: Any, glib: Any, genicam: Any) -> Iterator[Feature]:
@@ -116,4 +128,6 @@ def _feature(aravis: Any, glib: Any, node: Any, category: str) -> Feature:
 def _shown(limit: int | float | str | None) -> str:
     if limit is None:
         return ""
-    return f"{limit:.10g}" if isinstance(limit, float) else str(limit)
+    if isinstance(limit, float):
+        return "" if limit and not 1 / NO_LIMIT < abs(limit) < NO_LIMIT else f"{limit:.10g}"
+    return str(limit)
