@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from binpick import cli
+from binpick import cli, demo
 from binpick.camera import backends, controller
 from binpick.errors import CameraLost
 from binpick.settings.cell import AravisCameras, CameraAddress
@@ -184,6 +184,15 @@ def test_check_looks_at_the_host_alone_and_finds_a_camera_by_its_serial_number(g
     assert {"receive buffer", "firewall", "clock", "processors"} <= set(found)
     assert "ports" not in found
     assert "cameras" not in found
+
+
+@pytest.mark.gige
+def test_check_of_a_cell_whose_cameras_are_away_points_to_the_host(call: Call, tmp_path: Path, free_port: int) -> None:
+    demo.files(demo.Plan(cameras=(NOBODY, NOBODY), rest_port=free_port, modbus_port=free_port), tmp_path)
+    code, out, _ = call("check", "--json", "--cell", str(tmp_path / "cell.yaml"))
+    cameras = json.loads(out)[-1]
+    assert (code, cameras["what"]) == (3, "cameras")
+    assert cameras["command"] == f"binpick check --host --cell {tmp_path / 'cell.yaml'}"
 
 
 def test_check_prints_the_commands_whole_below_the_findings(call: Call, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_host_in_order_has_nothing_to_mend() -> None:
     (replace(GOOD, netdev_max_backlog=1000), "packet backlog", "warn", "dropped", "net.core.netdev_max_backlog=5000"),
     (replace(GOOD, netdev_max_backlog=None), "packet backlog", "unknown", "cannot be read", ""),
     (replace(GOOD, firewall=None), "firewall", "unknown", "root", "sudo nft list ruleset"),
-    (replace(GOOD, firewall="ufw"), "firewall", "warn", "no rule", "sudo ufw allow proto udp from 169.254.1.2"),
+    (replace(GOOD, firewall="ufw"), "firewall", "warn", "no rule", "sudo ufw allow proto udp from 169.254.1.2 to any"),
     (replace(GOOD, firewall="firewalld"), "firewall", "warn", "no rule",
      "--add-source=169.254.2.2 && sudo firewall-cmd --reload"),
     (replace(GOOD, firewall="iptables"), "firewall", "warn", "no rule", "-p udp -s 169.254.1.2,169.254.2.2 -j ACCEPT"),
@@ -120,6 +120,8 @@ def test_two_ports_in_one_subnet(of_port: int, of_all: int, level: str) -> None:
 def test_cameras_on_loopback_need_no_network() -> None:
     found = judge(GOOD, (("left", "127.0.0.2"), ("right", "127.0.0.3")), 1500)
     assert [finding.what for finding in found[:3]] == ["way to left", "way to right", "receive buffer"]
+    (firewall,) = wrong(replace(GOOD, firewall="ufw"), (("left", "127.0.0.2"), ("right", "")))[1:]
+    assert (firewall.what, firewall.command) == ("firewall", "")
 
 
 def test_the_buffer_is_the_one_that_the_driver_asks_for() -> None:

@@ -1,6 +1,7 @@
 """Judges a host's snapshot: what would cost images, why, and the command that mends it."""
 
 from collections.abc import Iterator, Sequence
+from ipaddress import IPv4Address
 
 from binpick.host import network
 from binpick.host.finding import Finding, sysctl
@@ -21,7 +22,15 @@ def judge(host: Host, cameras: Sequence[tuple[str, str]], packet_size: int) -> l
     `packet_size` is the GVSP packet size with its IP header, bytes. Loopback cameras need nothing of a network.
     """
     return [*network.judge(host, cameras, packet_size), *_socket_buffer(host), *_backlog(host),
-            *_firewall(host, [address for _, address in cameras if address]), *_clock(host), *_processors(host)]
+            *_firewall(host, [address for _, address in cameras if _remote(address)]), *_clock(host), *_processors(host)]
+
+
+def _remote(address: str) -> bool:
+    """An address, and not one of this host's own: loopback passes every firewall."""
+    try:
+        return not IPv4Address(address).is_loopback
+    except ValueError:
+        return False
 
 
 def _socket_buffer(host: Host) -> Iterator[Finding]:
@@ -70,7 +79,7 @@ def _admit(firewall: str, addresses: Sequence[str]) -> str:
     if not addresses:
         return ""
     if firewall == "ufw":
-        return " && ".join(f"sudo ufw allow proto udp from {address}" for address in addresses)
+        return " && ".join(f"sudo ufw allow proto udp from {address} to any" for address in addresses)
     if firewall == "firewalld":
         sources = " ".join(f"--add-source={address}" for address in addresses)
         return f"sudo firewall-cmd --permanent --zone=trusted {sources} && sudo firewall-cmd --reload"
