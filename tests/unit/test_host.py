@@ -78,12 +78,15 @@ def test_a_camera_without_a_way_gets_an_address_on_a_port_that_has_none() -> Non
     left, right = wrong(host)
     assert (left.level, right.level) == ("fail", "fail")
     assert "through the router 192.168.0.1" in left.seen
-    assert left.command == "sudo ip addr add 169.254.1.1/24 dev eth2"      # its link is up
-    assert right.command == "sudo ip addr add 169.254.2.1/24 dev eth1"
+    assert left.command == "sudo ip addr add 169.254.1.1/24 dev eth2 && sudo ip link set dev eth2 up"      # it has a link
+    assert right.command == "sudo ip addr add 169.254.2.1/24 dev eth1 && sudo ip link set dev eth1 up"
     (alone,) = wrong(replace(host, routes=host.routes[1:], ports=(uplink,)), cameras=(("left", "10.0.0.1"),))
-    assert alone.command == "sudo ip addr add 10.0.0.2/24 dev IFACE"
+    assert alone.command.startswith("sudo ip addr add 10.0.0.2/24 dev IFACE &&")
     assert "no route" in alone.seen
     assert "IFACE stands for" in alone.reason
+    both = wrong(host, cameras=(("left", "10.0.0.1"), ("right", "10.0.0.2")))      # behind one switch
+    assert {finding.command for finding in both} == {
+        "sudo ip addr add 10.0.0.3/24 dev eth2 && sudo ip link set dev eth2 up"}
 
 
 def test_an_address_that_is_none_and_one_that_is_not_known() -> None:
@@ -139,6 +142,8 @@ eth1\t0001FEA9\t00000000\t0001\t0\t0\t0\t00FFFFFF\t0\t0\t0
 """,
     "sys/class/net/eth0/mtu": "1500\n", "sys/class/net/eth0/operstate": "down\n", "sys/class/net/eth0/speed": "-1\n",
     "sys/class/net/eth1/mtu": "9000\n", "sys/class/net/eth1/carrier": "1\n", "sys/class/net/eth1/speed": "1000\n",
+    "sys/class/net/wlan0/mtu": "1500\n", "sys/class/net/wlan0/device/vendor": "0x8086\n",
+    "sys/class/net/wlan0/phy80211/index": "0\n",
     "sys/class/net/eth1/device/vendor": "0x8086\n", "sys/class/net/bonding_masters": "\n",
     "sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet\n",
     "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "powersave\n", "sys/devices/system/cpu/cpu1/online": "1\n",
@@ -153,7 +158,8 @@ def test_a_snapshot_is_read_from_the_kernels_files(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     assert read(tmp_path) == Host(
-        ports=(Port("eth0", 1500, up=False), Port("eth1", 9000, up=True, speed_mbps=1000, rp_filter=1, physical=True)),
+        ports=(Port("eth0", 1500, up=False), Port("eth1", 9000, up=True, speed_mbps=1000, rp_filter=1, physical=True),
+               Port("wlan0", 1500, up=False)),
         routes=(Route("eth0", "0.0.0.0/0", "192.0.2.1", 100), Route("eth1", "169.254.1.0/24")),
         rmem_max=212992, rmem_default=212992, netdev_max_backlog=1000, rp_filter=2, clocksource="hpet",
         ptp_ports=("eth1", "eth3"), cpus=2, governors=("powersave",), kernel="6.1.0-18-amd64")

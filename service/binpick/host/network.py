@@ -1,7 +1,7 @@
 """Judges the way from each camera to this host: route, link, packet size, receive ring, and what two ports share."""
 
 from collections.abc import Iterator, Sequence
-from ipaddress import IPv4Address, IPv4Network
+from ipaddress import IPv4Network
 
 from binpick.host.finding import Finding, sysctl
 from binpick.host.snapshot import Host, Port, Route
@@ -17,9 +17,9 @@ KEPT = "the command holds until the next start; for good: {} in the [Link] secti
 def judge(host: Host, cameras: Sequence[tuple[str, str]], packet_size: int) -> Iterator[Finding]:
     """As `findings.judge`; the ports follow the cameras that they lead to."""
     ports: dict[str, list[str]] = {}
-    spare = _spare(host)
+    offers = Offers(host, [address for _, address in cameras])
     for name, address in cameras:
-        route, finding = _way(host, name, address, spare)
+        route, finding = _way(host, name, address, offers)
         yield finding
         if route is not None and route.port != "lo":
             ports.setdefault(route.port, []).append(name)
@@ -33,14 +33,30 @@ def judge(host: Host, cameras: Sequence[tuple[str, str]], packet_size: int) -> I
     yield from _ptp(host, tuple(ports))
 
 
-def _spare(host: Host) -> Iterator[str]:
-    """Real ports without any subnet, those with a link first: where a camera's subnet probably belongs."""
-    taken = {route.port for route in host.routes}
-    yield from (port.name for up in (True, False) for port in host.ports
-                if port.physical and bool(port.up) is up and port.name not in taken)
+class Offers:
+    """The command that puts a port into a camera's subnet; cameras of one subnet get one port.
+
+    Offered are real ports without any subnet, those with a link first: that is where a camera's subnet probably belongs.
+    """
+
+    def __init__(self, host: Host, cameras: Sequence[str]) -> None:
+        taken = {route.port for route in host.routes}
+        self._ports = iter([port.name for up in (True, False) for port in host.ports
+                            if port.physical and bool(port.up) is up and port.name not in taken])
+        self._cameras = cameras
+        self._made: dict[IPv4Network, str] = {}
+
+    def command(self, address: str) -> str:
+        """IFACE stands in it where no port is left to offer."""
+        subnet = IPv4Network(f"{address}/24", strict=False)      # the smallest that people use
+        if subnet not in self._made:
+            beside = next(str(host) for host in subnet.hosts() if str(host) not in self._cameras)
+            port = next(self._ports, "IFACE")
+            self._made[subnet] = f"sudo ip addr add {beside}/24 dev {port} && sudo ip link set dev {port} up"
+        return self._made[subnet]
 
 
-def _way(host: Host, name: str, address: str, spare: Iterator[str]) -> tuple[Route | None, Finding]:
+def _way(host: Host, name: str, address: str, offers: Offers) -> tuple[Route | None, Finding]:
     what = f"way to {name}"
     if not address:
         return None, Finding(what, "unknown", "the cell file gives no address, and no camera of its serial number answers")
@@ -51,18 +67,11 @@ def _way(host: Host, name: str, address: str, spare: Iterator[str]) -> tuple[Rou
     if route is not None and not route.gateway:
         return route, Finding(what, "ok", f"{address} by {route.port}")
     seen = f"{address}: no route" if route is None else f"{address} by {route.port}, through the router {route.gateway}"
-    port = next(spare, "IFACE")
-    which = "" if port != "IFACE" else "; IFACE stands for the port's name"
+    command = offers.command(address)
+    which = "; IFACE stands for the port's name" if "IFACE" in command else ""
     return None, Finding(what, "fail", seen, "no port of this host is in the camera's subnet: give the one that leads to it "
                          f"an address there{which}; the command holds until the next start, the network's settings for good",
-                         f"sudo ip addr add {_neighbour(address)} dev {port}")
-
-
-def _neighbour(address: str) -> str:
-    """An address beside the camera's, in the smallest subnet that people use."""
-    subnet = IPv4Network(f"{address}/24", strict=False)
-    host = next(host for host in subnet.hosts() if host != IPv4Address(address))
-    return f"{host}/24"
+                         command)
 
 
 def _port(port: Port, led: Sequence[str], packet_size: int) -> Iterator[Finding]:

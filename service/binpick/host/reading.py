@@ -53,7 +53,7 @@ def _ports(root: Path) -> Iterator[Port]:
         yield Port(name=path.name, mtu=mtu, up=bool(carrier) if carrier is not None else _text(path / "operstate") == "up",
                    speed_mbps=speed if speed is not None and speed > 0 else None,
                    rp_filter=_number(root / "proc/sys/net/ipv4/conf" / path.name / "rp_filter") or 0,
-                   physical=(path / "device").exists())
+                   physical=(path / "device").exists() and not (path / "phy80211").exists())
 
 
 def _routes(path: Path) -> Iterator[Route]:

@@ -18,6 +18,7 @@ class Port:
     rx_ring: tuple[int, int] | None = None
     """Receive descriptors, now and at most."""
     physical: bool = False
+    """A socket for a cable: no bridge, tunnel or radio."""
 
 
 @dataclass(frozen=True, slots=True)
