@@ -1,6 +1,5 @@
 """Finds cameras and reads all that they say, without keeping hold of one: a daemon may take it the next moment."""
 
-import contextlib
 import ctypes
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -62,16 +61,24 @@ def describe(address: str) -> Description:
         if mine:
             device.leave_control()
         features = tuple(_features(aravis, glib, device.get_genicam()))
-        return Description(address, _genicam_xml(device), features, dict(_registers(glib, device)), controlled=not mine)
+        return Description(address, _genicam_xml(device), features, dict(_registers(aravis, glib, device)), controlled=not mine)
     except glib.Error as error:
         raise CameraLost(f"the camera at {address} stopped answering ({error.message}): check its power, cable and "
                          "network") from None
 
 
-def _registers(glib: Any, device: Any) -> Iterator[tuple[str, str]]:
+def _registers(aravis: Any, glib: Any, device: Any) -> Iterator[tuple[str, str]]:
     for address in BOOTSTRAP:
-        with contextlib.suppress(glib.Error):        # an optional one
+        try:
             yield f"{address:#06x}", f"{device.read_register(address):#010x}"
+        except glib.Error as error:                  # an optional one
+            _require_alive(aravis, error)
+
+
+def _require_alive(aravis: Any, error: Any) -> None:
+    """Raises the error of a camera that is gone: each further try would take Aravis seconds."""
+    if error.matches(aravis.device_error_quark(), aravis.DeviceError.TIMEOUT):
+        raise error
 
 
 def _features(aravis: Any, glib: Any, genicam: Any) -> Iterator[Feature]:
@@ -95,12 +102,11 @@ def _features(aravis: Any, glib: Any, genicam: Any) -> Iterator[Feature]:
 
 def _feature(aravis: Any, glib: Any, node: Any, category: str) -> Feature:
     def read(function: Callable[[], Any], default: Any = None) -> Any:
-        """What many descriptions leave out is no fault; a camera that is gone is, as each try then takes seconds."""
+        """What many descriptions leave out is no fault."""
         try:
             return function()
         except glib.Error as error:
-            if error.matches(aravis.device_error_quark(), aravis.DeviceError.TIMEOUT):
-                raise
+            _require_alive(aravis, error)
             return default
 
     facts: dict[str, Any] = {"name": str(node.get_name()), "category": category, "kind": str(node.get_node_name())}
@@ -119,8 +125,7 @@ def _feature(aravis: Any, glib: Any, node: Any, category: str) -> Feature:
     try:
         value = node.get_value_as_string()
     except glib.Error as error:
-        if error.matches(aravis.device_error_quark(), aravis.DeviceError.TIMEOUT):
-            raise
+        _require_alive(aravis, error)
         return Feature(**facts, trouble=str(error.message))
     return Feature(**facts, value=str(value if value is not None else ""))
 
