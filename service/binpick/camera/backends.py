@@ -1,9 +1,12 @@
 """The one place that picks a camera backend."""
 
 from binpick.camera.aravis import AravisCamera
+from binpick.camera.aravis.inventory import describe, discover, version
 from binpick.camera.base import Camera
 from binpick.camera.files import FileCamera
 from binpick.settings.cell import AravisCameras, FileCameras
+
+__all__ = ["describe", "discover", "make", "version"]
 
 
 def make(settings: AravisCameras | FileCameras) -> tuple[Camera, Camera]:
