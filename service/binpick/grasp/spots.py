@@ -59,6 +59,8 @@ class Patch:
     def of_cup(self, number: int) -> "Patch":
         """One cup's places."""
         mine = self.cup == number
+        if mine.all():
+            return self
         return replace(self, local=self.local[:, mine], own=self.own[:, mine], place=self.place[:, mine], cup=self.cup[mine],
                        lip=self.lip[mine])
 
