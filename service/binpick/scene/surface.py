@@ -119,7 +119,8 @@ def _planes(disparity: Field, wanted: Mask) -> tuple[Int64[np.ndarray, "n"], Val
 
 def _framed(pixels: Int64[np.ndarray, "n"], width: int) -> Int64[np.ndarray, "n"]:
     """Pixels of a picture that is this wide in one that has a frame of RADIUS around it."""
-    return pixels + pixels // width * (2 * RADIUS) + RADIUS * (width + 2 * RADIUS + 1)
+    framed: Int64[np.ndarray, "n"] = pixels + pixels // width * (2 * RADIUS) + RADIUS * (width + 2 * RADIUS + 1)
+    return framed
 
 
 def around(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
