@@ -62,15 +62,17 @@ def _inside(surface: Surface, model: Bin) -> Mask:
 
 def _drop_small(labels: Labels, least: int) -> Labels:
     """Only segments of at least `least` pixels, counted anew from 1 in reading order."""
-    sizes = np.bincount(labels.ravel(), minlength=1)
+    place = np.flatnonzero(labels)
+    label = labels.ravel()[place]
+    sizes = np.bincount(label, minlength=1)
     # the first pixel of each: written backwards, the first one is written last
-    first, place = np.zeros(len(sizes), dtype=np.int64), np.flatnonzero(labels)[::-1]
-    first[labels.ravel()[place]] = place
+    first = np.zeros(len(sizes), dtype=np.int64)
+    first[label[::-1]] = place[::-1]
     keep = np.flatnonzero(sizes >= least)
-    keep = keep[keep > 0]
     renumbered = np.zeros(len(sizes), dtype=np.int32)
     renumbered[keep[np.argsort(first[keep])]] = np.arange(1, len(keep) + 1, dtype=np.int32)
-    kept: Labels = renumbered[labels]
+    kept: Labels = np.zeros(labels.shape, dtype=np.int32)
+    kept.ravel()[place] = renumbered[label]
     return kept
 
 
