@@ -47,8 +47,8 @@ def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
     sigma_m = surface.sigma_z_m.ravel()[pixels]
     # each pixel's place among those of interest, -1 for others, with a frame as wide as ways are long
     wide = 2 * half_px
-    place = np.full((rows + wide, cols + 2 * wide), -1, dtype=np.int32)
-    place[:rows, wide:-wide][of_interest] = np.arange(len(pixels), dtype=np.int32)
+    place = np.full((rows + wide, cols + 2 * wide), -1)
+    place[:rows, wide:-wide][of_interest] = np.arange(len(pixels))
     framed = pixels + pixels // cols * (2 * wide) + wide
     found = []
     for direction in DIRECTIONS:

@@ -54,10 +54,12 @@ def _inside(surface: Surface, model: Bin) -> Mask:
     """Measured points with a normal, above the floor and not of a wall."""
     length, width, _ = model.inner_size_m
     side = length / 2 - WALL_M, width / 2 - WALL_M
-    inside = cv2.inRange(surface.xyz, (-side[0], -side[1], LEAST_M), (*side, np.inf)) > 0
+    inside = np.asarray(cv2.inRange(surface.xyz, (-side[0], -side[1], LEAST_M), (*side, np.inf)) > 0)
+    place = np.flatnonzero(inside)
+    z, across = surface.xyz.reshape(-1, 3)[place, 2], surface.normal.reshape(-1, 3)[place, 0]
     with np.errstate(invalid="ignore"):
-        above = surface.xyz[..., 2] > 3 * surface.sigma_z_m
-    return np.asarray(inside & above & np.isfinite(surface.normal[..., 0]))
+        inside.ravel()[place] = (z > 3 * surface.sigma_z_m.ravel()[place]) & np.isfinite(across)
+    return inside
 
 
 def _drop_small(labels: Labels, least: int) -> Labels:

@@ -46,7 +46,8 @@ class Surface:
 
     def cut(self, box: tuple[slice, slice]) -> "Surface":
         """Its rows and columns in a box."""
-        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box], self.eyes)
+        xyz, normal, sigma_z_m = (np.ascontiguousarray(field[box]) for field in (self.xyz, self.normal, self.sigma_z_m))
+        return Surface(xyz, normal, sigma_z_m, self.eyes)
 
 
 def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform, box_bin: Box | None = None) -> Surface:
