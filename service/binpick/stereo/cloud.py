@@ -2,11 +2,9 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
 
 from binpick import geometry
 from binpick.data import Depth, OrganisedCloud, Rectified, frozen
-from binpick.geometry import Transform
 
 
 def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
@@ -20,9 +18,3 @@ def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
     xyz = geometry.transform(rectified.T_camera_rect, rect)
     sigma_z_m = z * z * depth.sigma_px / depth_scale
     return OrganisedCloud(xyz=frozen(xyz), sigma_z_m=frozen(sigma_z_m), window=view)
-
-
-def eyes(rectified: Rectified, T_bin_camera: Transform) -> Float64[np.ndarray, "2 3"]:
-    """Where both cameras are, in the bin's frame."""
-    T_bin_rect = T_bin_camera @ rectified.T_camera_rect
-    return geometry.transform(T_bin_rect, np.array([[0.0, 0.0, 0.0], [rectified.baseline_m, 0.0, 0.0]]))
