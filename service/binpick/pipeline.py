@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32
@@ -101,19 +102,17 @@ def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
         shots = tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
     with clock.stage("match"):
         rectified, depth = stereo.of_shots(shots, inputs.job.recipe.lights, inputs.job.recipe.stereo)
-    with clock.stage("cloud"):
-        points = cloud.reproject(depth, rectified)
-    return _scene(inputs, frames, clock, rectified, depth, points)
+    return _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
 
 
 def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Rectified, depth: Depth,
-           points: OrganisedCloud) -> CycleResult:
+           points: Callable[[], OrganisedCloud]) -> CycleResult:
     """From depth to the answer."""
     job = inputs.job
     measured = float(depth.measured.mean())
     if job.bin.locate and measured >= LEAST_MEASURED:
         with clock.stage("locate"):
-            frames = frames.located(locate(points.xyz, job.bin, frames.T_camera_bin))
+            frames = frames.located(locate(points().xyz, job.bin, frames.T_camera_bin))
         if frames.location is not None and frames.location.fault is not None:
             return CycleResult(answer(inputs, frames, clock.spent(), frames.location.fault), rectified, depth, points)
     with clock.stage("bin"):
