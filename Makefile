@@ -23,6 +23,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing Python packages (1.5 GB on disk, 2 to 5 minutes) ..."
 	@deploy/install-python $(VENV) hatchling editables
 	@deploy/install-python $(VENV) --no-build-isolation --editable '.[sim,dev]'
+	@echo "Compiling the loops over pixels ..."
+	@$(BIN)/python -c 'from binpick.settings.stereo import PRESETS; from binpick.stereo import depth; [depth.warm(p) for p in PRESETS.values()]'
 	@touch $@
 
 install-test: $(STAMP)

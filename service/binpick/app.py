@@ -65,6 +65,7 @@ def run_file(path: Path) -> NoReturn:
     for warning in warnings:
         log.warning(warning)
     _load_meshes(cell)
+    _compile(cell)
     run(cell, rig, cameras(cell))
     leave()
 
@@ -75,6 +76,14 @@ def _load_meshes(cell: settings.Cell) -> None:
         from binpick.grasp import shape
 
         shape.load(mesh)
+
+
+def _compile(cell: settings.Cell) -> None:
+    """Has machine code made of the loops over pixels, once after an installation: no cycle waits for it."""
+    from binpick.stereo import depth
+
+    for stereo in {recipe.stereo.model_dump_json(): recipe.stereo for recipe in cell.recipes}.values():
+        depth.warm(stereo)
 
 
 def leave() -> NoReturn:

@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32
@@ -35,7 +37,7 @@ from binpick.scene import bin as load_carrier
 from binpick.scene import heightmap
 from binpick.scene import segment as segmentation
 from binpick.scene.location import locate
-from binpick.scene.surface import surface
+from binpick.scene.surface import Surface, surface
 from binpick.settings import Job, SuctionTool
 from binpick.stereo import cloud, rectify
 from binpick.stereo import depth as stereo
@@ -100,37 +102,33 @@ def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
         shots = tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
     with clock.stage("match"):
         rectified, depth = stereo.of_shots(shots, inputs.job.recipe.lights, inputs.job.recipe.stereo)
-    with clock.stage("cloud"):
-        points = cloud.reproject(depth, rectified)
-    return _scene(inputs, frames, clock, rectified, depth, points)
+    return _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
 
 
 def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Rectified, depth: Depth,
-           points: OrganisedCloud) -> CycleResult:
+           points: Callable[[], OrganisedCloud]) -> CycleResult:
     """From depth to the answer."""
     job = inputs.job
     measured = float(depth.measured.mean())
     if job.bin.locate and measured >= LEAST_MEASURED:
         with clock.stage("locate"):
-            frames = frames.located(locate(points.xyz, job.bin, frames.T_camera_bin))
+            frames = frames.located(locate(points().xyz, job.bin, frames.T_camera_bin))
         if frames.location is not None and frames.location.fault is not None:
             return CycleResult(answer(inputs, frames, clock.spent(), frames.location.fault), rectified, depth, points)
     with clock.stage("bin"):
         grid = surface(depth, rectified, geometry.inverse(frames.T_camera_bin),
                        segmentation.box(job.bin, job.recipe.limits.above_rim_m))
-        eyes_bin = cloud.eyes(rectified, geometry.inverse(frames.T_camera_bin))
-        heights = heightmap.height_map(grid.xyz, job.bin, eyes_bin)
-        filled = load_carrier.filling(heights, job.bin, job.recipe.part)
-        scene = clearance.obstacles(heights, job.bin)
-    seen = CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points,
-                       T_camera_bin=frames.T_camera_bin)
     if measured < LEAST_MEASURED:
-        return seen
+        _, filled, _ = _contents(grid, job)
+        return CycleResult(answer(inputs, frames, clock.spent(), Code.NO_DEPTH, filled), rectified, depth, points,
+                           T_camera_bin=frames.T_camera_bin)
+    with clock.stage("segment"), ThreadPoolExecutor(1, thread_name_prefix="binpick-contents") as beside:
+        contents = beside.submit(_contents, grid, job)
+        segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
+        heights, filled, scene = contents.result()
     with clock.stage("memory"):
         verdicts = verification.verified(inputs.memory, heights)
         inputs = replace(inputs, memory=memory.standing(inputs.memory, heights, inputs.pair.captured_at, verdicts))
-    with clock.stage("segment"):
-        segments = segmentation.segment(grid, job.bin, job.recipe.part, job.recipe.segment)
     found, counts, parts = _offered(inputs, frames, clock, rectified, segments, grid.sigma_z_m, scene)
     with clock.stage("clearance"):
         kept, clear_counts = _clear(found, segments, heights, scene, inputs)
@@ -144,7 +142,13 @@ def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Recti
         after = memory.looked(inputs, published, T_bin_frame, heights, segments)
     result = answer(inputs, frames, clock.spent(), code, filled, published, counts)
     result = result.model_copy(update={"parts": part_messages(parts, inputs, frames) if code.carries_poses else ()})
-    return replace(seen, result=result, segments=segments, verified=verdicts, memory=after)
+    return CycleResult(result, rectified, depth, points, segments, verdicts, after, frames.T_camera_bin)
+
+
+def _contents(grid: Surface, job: Job) -> tuple[HeightMap, load_carrier.Filling, clearance.Obstacles]:
+    """What the bin's surface says without its parts being told apart."""
+    heights = heightmap.height_map(grid.xyz, job.bin, grid.eyes)
+    return heights, load_carrier.filling(heights, job.bin, job.recipe.part), clearance.obstacles(heights, job.bin)
 
 
 def _offered(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Rectified, segments: Segments,

@@ -3,6 +3,7 @@
 A `Result` is serialised once to bytes; REST sends those, the registers are filled from the same object. Metres, radians.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -235,13 +236,19 @@ class CycleResult:
     result: Result
     rectified: Rectified | None = None
     depth: Depth | None = None
-    cloud: OrganisedCloud | None = None
+    reprojected: Callable[[], OrganisedCloud] | None = None
+    """Makes the cloud: no cycle waits for what only people look at."""
     segments: Segments | None = None
     verified: tuple[Attempt, ...] = ()
     """What became of grasps of the last cycle that nobody spoke of, as far as heights tell."""
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
     T_camera_bin: Transform | None = None
+
+    @property
+    def cloud(self) -> OrganisedCloud | None:
+        """The organised cloud, made anew each time that somebody asks."""
+        return None if self.reprojected is None else self.reprojected()
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:

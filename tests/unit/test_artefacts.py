@@ -73,7 +73,7 @@ def cycle(code: Code = Code.OK, *grasps: GraspMessage) -> CycleResult:
         result, Rectified(padded, padded, window, MARGIN, FOCAL, 0.15, 220.0, 160.0, T_CAMERA_RECT),
         Depth(disparity, np.nan_to_num(disparity), (measured * 255).astype(np.uint8), measured,
               np.where(measured, np.float32(0.2), np.float32(np.nan))),
-        OrganisedCloud(xyz, np.zeros(shape, np.float32), window), segments)
+        lambda: OrganisedCloud(xyz, np.zeros(shape, np.float32), window), segments)
 
 
 def grasp(T_frame_tcp: Transform, frame: FrameName, rank: int = 1) -> GraspMessage:
@@ -170,7 +170,7 @@ def test_a_bin_that_was_not_found_is_outlined_where_it_was_expected() -> None:
 @pytest.mark.parametrize("code", [Code.OK, Code.BIN_EMPTY, Code.TIMEOUT])
 def test_every_artefact_exists_however_far_the_cycle_came(name: str, code: Code) -> None:
     whole = cycle(code)
-    stages = (whole, replace(whole, segments=None), replace(whole, segments=None, cloud=None, depth=None),
+    stages = (whole, replace(whole, segments=None), replace(whole, segments=None, reprojected=None, depth=None),
               CycleResult(whole.result))
     for reached in stages:
         body = artefacts.render(inputs(), reached, name)[1]
@@ -180,11 +180,12 @@ def test_every_artefact_exists_however_far_the_cycle_came(name: str, code: Code)
 def test_an_all_black_cycle_has_an_empty_cloud_and_says_that_nothing_was_measured() -> None:
     whole = cycle(Code.NO_DEPTH)
     assert whole.depth is not None
-    assert whole.cloud is not None
+    cloud = whole.cloud
+    assert cloud is not None
     nothing = np.zeros((HEIGHT, WIDTH), bool)
     blind = replace(
         whole, depth=replace(whole.depth, measured=nothing, disparity=np.full((HEIGHT, WIDTH), np.nan, np.float32)),
-        cloud=replace(whole.cloud, xyz=np.full((HEIGHT, WIDTH, 3), np.nan, np.float32)))
+        reprojected=lambda: replace(cloud, xyz=np.full((HEIGHT, WIDTH, 3), np.nan, np.float32)))
     assert artefacts.render(inputs(), blind, "cloud.ply")[1].endswith(b"end_header\n")
     shown = picture(artefacts.render(inputs(), blind, "disparity.png")[1])[STRIP:]
     assert (shown == artefacts.NOT_MEASURED).all()

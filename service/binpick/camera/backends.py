@@ -2,11 +2,14 @@
 
 from binpick.camera import sync
 from binpick.camera.aravis import AravisCamera, Setup
+from binpick.camera.aravis.inventory import describe, discover, version
 from binpick.camera.base import Camera
 from binpick.camera.files import FileCamera
 from binpick.camera.group import CameraGroup
 from binpick.camera.starter import Starter
 from binpick.settings.cell import AravisCameras, FileCameras
+
+__all__ = ["NAMES", "describe", "discover", "group", "make", "version"]
 
 NAMES = ("left", "right", "third", "fourth", "fifth")
 

@@ -6,6 +6,7 @@ from typing import Any
 import typer
 
 from binpick.cli.bench import bench
+from binpick.cli.cameras import cameras
 from binpick.cli.check import check
 from binpick.cli.demo import demo
 from binpick.cli.depth import depth
@@ -19,6 +20,7 @@ COMMANDS: tuple[Callable[..., Any] | typer.Typer, ...] = (
     demo,
     run,
     check,
+    cameras,
     sim,
     pick,
     depth,

@@ -13,29 +13,39 @@ if TYPE_CHECKING:
     from binpick.cell import Cameras
     from binpick.rig import Rig
     from binpick.settings import Bin, Cell, Recipe, Tool
+    from binpick.settings.cell import CameraAddress
     from binpick.settings.mesh import Mesh
 
 CAMERA_LIMIT_S = 10.0
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at; `fault` is empty when it is well, and `exit_code` says what kind of fault."""
+    """One thing that was looked at; `fault` is empty when it is well, and `exit_code` says what kind of fault.
+
+    `warning`: no fault, but it may become one, or could not be seen. `command` mends either.
+    """
 
     what: str
     seen: str
     fault: str = ""
     exit_code: int = 0
+    warning: str = ""
+    command: str = ""
 
 
 def check(
     cell: Annotated[Path, typer.Option(help="Cell file.")],
+    host: Annotated[bool, typer.Option("--host", help="Look at this machine instead: the network to the cameras, kernel "
+                                                      "settings, clock, processors; also while the daemon runs.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> None:
     """Look at everything `run` needs: cell file, rig, free ports, cameras and one pair of images.
 
+    With --host, at the machine instead, and print the commands that mend it. Nothing is changed by looking.
+
     Exit code 0: all is well. 2: a file or a setting is wrong. 3: a camera does not answer.
     """
-    found = list(findings(cell))
+    found = list(_of_host(cell) if host else findings(cell))
     if as_json:
         typer.echo(json.dumps([finding._asdict() for finding in found], indent=1))
     else:
@@ -70,11 +80,42 @@ def findings(path: Path) -> Iterator[Finding]:
     cameras = app.cameras(cell)
     try:
         opened = _tried("cameras", partial(_open, cell, cameras))
-        yield opened
+        yield opened._replace(command=f"binpick check --host --cell {path}" if opened.exit_code == 3 else "")
         if not opened.fault:
             yield _tried("a pair of images", partial(_capture, cell, rig, cameras))
     finally:
         cameras.close()
+
+
+def _of_host(path: Path) -> Iterator[Finding]:
+    """The machine, as the cameras of this cell file need it. Raises SettingsError."""
+    from binpick import host, settings
+
+    cell = settings.load(path)
+    cameras, packet_size = cell.cameras, 0
+    places: list[tuple[str, str]] = []
+    if cameras.backend == "aravis":
+        packet_size = 0 if cameras.packet_size == "auto" else cameras.packet_size
+        places = [("left", _address(cameras.left)), ("right", _address(cameras.right))]
+    for finding in host.judge(host.look(), places, packet_size):
+        first = "unknown" if finding.level == "unknown" else ""
+        told = ": ".join(part for part in (first, finding.seen, finding.reason) if part)
+        fails, well = finding.level == "fail", finding.level == "ok"
+        yield Finding(finding.what, finding.seen, told if fails else "", 2 if fails else 0,
+                      "" if fails or well else told, finding.command)
+
+
+def _address(camera: "CameraAddress") -> str:
+    """Where it is; one that is known by its serial number alone is searched. Empty: it does not answer."""
+    from binpick.camera import backends
+    from binpick.errors import CameraError
+
+    if camera.address:
+        return camera.address
+    try:
+        return next((found.address for found in backends.discover() if found.serial == camera.serial), "")
+    except CameraError:
+        return ""
 
 
 def _numbers(items: "Iterable[Bin | Tool | Recipe]") -> str:
@@ -166,11 +207,18 @@ def _capture(cell: "Cell", rig: "Rig", cameras: "Cameras") -> str:
 
 def _tell(found: list[Finding]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
     for title in ("", "what", "found"):
         table.add_column(title, overflow="fold")
     for finding in found:
-        table.add_row("[red]FAIL[/]" if finding.fault else "[green]ok[/]", finding.what, finding.fault or finding.seen)
+        level = "[red]FAIL[/]" if finding.fault else "[yellow]look[/]" if finding.warning else "[green]ok[/]"
+        table.add_row(level, finding.what, escape(finding.fault or finding.warning or finding.seen))
     Console().print(table)
+    commands = dict.fromkeys(finding.command for finding in found if finding.command)
+    if commands:
+        typer.echo("\nCommands, in the order of the lines above:")      # below it: whole lines, for copying
+    for command in commands:
+        typer.echo(f"  {command}")

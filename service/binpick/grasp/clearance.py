@@ -112,9 +112,10 @@ def _beneath(low_m: Vector, high_m: Vector, scene: Obstacles) -> Float64[np.ndar
     cells = slice(low[1], high[1]), slice(low[0], high[0])
     x = origin[0] + (np.arange(low[0], high[0]) + 0.5) * scene.cell_m
     y = origin[1] + (np.arange(low[1], high[1]) + 0.5) * scene.cell_m
-    tops = np.stack([*np.meshgrid(x, y), scene.height[cells]], axis=-1).reshape(-1, 3)
-    rises = tops[:, 2] > low_m[2]
-    tops = tops[rises]
+    height = scene.height[cells]
+    rises = np.flatnonzero(height > low_m[2])
+    row, col = np.divmod(rises, len(x))
+    tops = np.stack([x[col], y[row], height.ravel()[rises]], axis=1)
     count = np.floor(np.minimum(scene.side[cells].ravel()[rises], tops[:, 2] - low_m[2]) / SIDE_STEP_M).astype(int)
     sides = np.repeat(tops, count, axis=0)
     sides[:, 2] -= (np.arange(len(sides)) - np.repeat(np.cumsum(count) - count, count) + 1) * SIDE_STEP_M
@@ -239,21 +240,14 @@ def blocked(grasps: list[Grasp], tool: Tool, heights: HeightMap) -> Bool[np.ndar
         return np.zeros(0, dtype=bool)
     local = (_shell(tool)[None] + _backs(tool)[:, None]).reshape(-1, 3)
     T_bin_tcp = np.stack([grasp.T_bin_tcp for grasp in grasps])
-    points = np.matmul(local, T_bin_tcp[:, :3, :3].transpose(0, 2, 1)) + T_bin_tcp[:, None, :3, 3]
-    height = height_at(points.reshape(-1, 3), heights).reshape(points.shape[:2])
-    hit: Bool[np.ndarray, "n"] = (height > points[..., 2]).any(axis=1)
+    x, y, z = np.moveaxis(np.matmul(T_bin_tcp[:, :3, :3], local.T) + T_bin_tcp[:, :3, 3:], 1, 0)
+    # nothing stands outside the map: the exact check knows the rim
+    framed = np.pad(heights.watertight, 1, constant_values=-np.inf)
+    rows, cols = framed.shape
+    j = np.clip(np.floor((x - heights.origin_x_m) / heights.cell_m) + 1, 0, cols - 1).astype(np.int32)
+    i = np.clip(np.floor((y - heights.origin_y_m) / heights.cell_m) + 1, 0, rows - 1).astype(np.int32)
+    hit: Bool[np.ndarray, "n"] = (framed.ravel()[i * cols + j] > z).any(axis=1)
     return hit
-
-
-def height_at(points: Float64[np.ndarray, "n 3"], heights: HeightMap) -> Float32[np.ndarray, "n"]:
-    """The solid's height under each point; nothing outside the map (the exact check knows the rim)."""
-    rows, cols = heights.watertight.shape
-    j = np.floor((points[:, 0] - heights.origin_x_m) / heights.cell_m).astype(int)
-    i = np.floor((points[:, 1] - heights.origin_y_m) / heights.cell_m).astype(int)
-    inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
-    height = np.full(len(points), -np.inf, dtype=np.float32)
-    height[inside] = heights.watertight[i[inside], j[inside]]
-    return height
 
 
 @functools.lru_cache(maxsize=16)

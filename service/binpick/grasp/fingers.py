@@ -4,8 +4,11 @@ A slice is cut from a part or a face in a frame of its own: z the approach (alon
 its principal axes. What is measured of it gives the width; the watertight height map says where the fingertips find room.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
@@ -92,20 +95,29 @@ def _room(cut: Slices, fingers: Fingers, scene: Obstacles, margin_m: float) -> R
     Fingers are as wide at their tips as further up: where tips passed with the same gap, the rest of the finger passes too.
     """
     room = Room(grip=np.zeros(len(cut.part)), gap_m=np.zeros(len(cut.part)))
-    way = np.arange(GRIPS[0] * fingers.pad_depth_m - LEVEL_M, -fingers.length_m, -LEVEL_M)[::-1] / fingers.pad_depth_m
-    for gap_m in GAPS_M:
-        free = np.flatnonzero(cut.width_m + 2 * gap_m <= fingers.stroke_max_m)
-        tips = _tips(cut.take(free), fingers, gap_m, margin_m)
-        for grip in (*way.tolist(), *GRIPS):
-            # deeper, the part would meet the finger above its pad
-            on_pad = cut.deep_m[free] + grip * fingers.pad_depth_m - cut.touch_m[free] <= fingers.pad_depth_m
-            free, tips = free[on_pad], tips[:, on_pad]
-            down = (grip * fingers.pad_depth_m * cut.R_bin_tcp[free, :, 2].T)[..., None].astype(np.float32)
-            clear = ~_inside(tips + down, scene)
-            free, tips = free[clear], tips[:, clear]
-            deeper = free[grip > room.grip[free]]
-            room.grip[deeper], room.gap_m[deeper] = grip, gap_m
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-room") as pool:
+        depths = list(pool.map(partial(_deepest, cut, fingers, scene, margin_m), GAPS_M))
+    for gap_m, grip in zip(GAPS_M, depths, strict=True):
+        deeper = np.flatnonzero(grip > room.grip)
+        room.grip[deeper], room.gap_m[deeper] = grip[deeper], gap_m
     return room
+
+
+def _deepest(cut: Slices, fingers: Fingers, scene: Obstacles, margin_m: float, gap_m: float) -> Float64[np.ndarray, "n"]:
+    """How deep the fingers of each slice come with one gap, in pad depths; 0 where they do not."""
+    deepest = np.zeros(len(cut.part))
+    way = np.arange(GRIPS[0] * fingers.pad_depth_m - LEVEL_M, -fingers.length_m, -LEVEL_M)[::-1] / fingers.pad_depth_m
+    free = np.flatnonzero(cut.width_m + 2 * gap_m <= fingers.stroke_max_m)
+    tips = _tips(cut.take(free), fingers, gap_m, margin_m)
+    for grip in (*way.tolist(), *GRIPS):
+        # deeper, the part would meet the finger above its pad
+        on_pad = cut.deep_m[free] + grip * fingers.pad_depth_m - cut.touch_m[free] <= fingers.pad_depth_m
+        free, tips = free[on_pad], tips[:, on_pad]
+        down = (grip * fingers.pad_depth_m * cut.R_bin_tcp[free, :, 2].T)[..., None].astype(np.float32)
+        clear = ~_inside(tips + down, scene)
+        free, tips = free[clear], tips[:, clear]
+        deepest[free] = np.maximum(deepest[free], grip)
+    return deepest
 
 
 def _tips(cut: Slices, fingers: Fingers, gap_m: float, margin_m: float) -> Float32[np.ndarray, "3 n k"]:

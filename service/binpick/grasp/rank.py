@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float64
 
 from binpick.data import Grasp, Segments
 from binpick.settings import SuctionTool, Tool
@@ -50,7 +51,8 @@ def ordered(grasps: list[Grasp], segments: Segments, *tools: Tool) -> list[Grasp
         }
         quality = segments.part_confidence[grasp.part_id] * sum(WEIGHTS[name] * value for name, value in terms.items())
         scored.append(replace(grasp, quality=round(min(max(quality * _hold(grasp, tool), 0.0), 1.0), 3)))
-    return sorted(scored, key=_key)
+    keys = _keys(scored, T_bin_tcp)
+    return [scored[i] for i in sorted(range(len(scored)), key=keys.__getitem__)]
 
 
 def _hold(grasp: Grasp, tool: Tool) -> float:
@@ -61,10 +63,10 @@ def _hold(grasp: Grasp, tool: Tool) -> float:
     return math.prod(1 - DOUBTS[name] * value for name, value in doubts.items())
 
 
-def _key(grasp: Grasp) -> tuple[float, ...]:
+def _keys(grasps: list[Grasp], T_bin_tcp: Float64[np.ndarray, "n 4 4"]) -> list[tuple[float, ...]]:
     """Quality to 0.001, then height, x, y to 1 mm: noise in the last bits cannot swap two grasps."""
-    x, y, z = np.round(grasp.T_bin_tcp[:3, 3], 3).tolist()
-    return (-grasp.quality, -z, x, y, *np.round(grasp.T_bin_tcp[:3, 2], 2).tolist())
+    at, approach = np.round(T_bin_tcp[:, :3, 3], 3).tolist(), np.round(T_bin_tcp[:, :3, 2], 2).tolist()
+    return [(-grasp.quality, -z, x, y, *way) for grasp, (x, y, z), way in zip(grasps, at, approach, strict=True)]
 
 
 def adds(grasp: Grasp, kept: list[Grasp]) -> bool:

@@ -104,14 +104,14 @@ def _sectors(patch: Patch, inner: float, outer: float, least: int = 2) -> Int32[
 
 def _fit_planes(x: Points, y: Points, z: Points, under: Chosen) -> tuple[Float64[np.ndarray, "n 2"], Values]:
     """z = level + slope · (x, y) by normal equations; a microscopic ridge (1 µm²) keeps spots without points solvable."""
-    solved = _least_squares(np.stack([x, y, np.ones_like(x)], axis=-1), z, under, 1e-12)
+    solved = _least_squares(np.stack([x, y, np.ones_like(x)], axis=1), z, under, 1e-12)
     return solved[:, :2], solved[:, 2]
 
 
-def _least_squares(columns: Float64[np.ndarray, "n k c"], z: Points, of: Chosen, ridge: float) -> Float64[np.ndarray, "n c"]:
-    """Coefficients of z in the columns over each row's selected points; the ridge keeps rows with too few solvable."""
-    chosen = (columns * of[..., None]).transpose(0, 2, 1)
-    normal = chosen @ columns + np.eye(columns.shape[2]) * ridge
+def _least_squares(rows: Float64[np.ndarray, "n c k"], z: Points, of: Chosen, ridge: float) -> Float64[np.ndarray, "n c"]:
+    """Coefficients of z in c functions over each spot's selected points; the ridge keeps spots with too few solvable."""
+    chosen = rows * of[:, None]
+    normal = chosen @ rows.transpose(0, 2, 1) + np.eye(rows.shape[1]) * ridge
     solved: Float64[np.ndarray, "n c"] = np.linalg.solve(normal, chosen @ z[..., None])[..., 0]
     return solved
 
@@ -121,8 +121,8 @@ def _bend(x: Points, y: Points, residual: Points, under: Chosen) -> Values:
 
     A bowl (a = c, b = 0) costs the lip nothing, it only sits deeper; a cylinder of radius R costs r² / 4R.
     """
-    columns = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=-1)
-    a, b, c = _least_squares(columns, residual, under, 1e-6)[:, :3].T
+    rows = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1)
+    a, b, c = _least_squares(rows, residual, under, 1e-6)[:, :3].T
     amplitude: Values = np.hypot((a - c) / 2, b / 2)
     return amplitude
 

@@ -4,7 +4,9 @@ All slices of a scene are cut at once: every measured point falls into a strip o
 one sort orders them, and a slice is a window over neighbouring strips.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TypeAlias
 
 import cv2
@@ -37,6 +39,7 @@ THIN = 2
 
 Values = Float64[np.ndarray, "n"]
 Windows = Float64[np.ndarray, "n strips"]
+Patch: TypeAlias = tuple[int, Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +93,16 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float, half_m: tuple[f
     """
     views = _views(_patches(segments), max_tilt_rad, half_m)
     turned = [(view, angle) for view in views for angle in _axes(view)]
+    # in two halves, however many threads there are, so that nothing depends on their number
+    halves = turned[:len(turned) // 2], turned[len(turned) // 2:]
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-slices") as pool:
+        one, other = pool.map(partial(_along, width_m=width_m), halves)
+    other = replace(other, axis=other.axis + len(halves[0]))
+    return Slices(*(np.concatenate([getattr(one, field.name), getattr(other, field.name)]) for field in fields(Slices)))
+
+
+def _along(turned: list[tuple[View, float]], width_m: float) -> Slices:
+    """All slices along some axes."""
     if not turned:
         whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
         return Slices(whole, whole, np.zeros((0, 3, 3)), real, real, real, real, real, np.zeros((0, 2)), real, real, real)
@@ -98,8 +111,7 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float, half_m: tuple[f
     known = np.isfinite(strips.low)
     which, window = np.nonzero(known.sum(axis=2) >= LEAST_STRIPS)
     low, high, low_z, high_z = (values[which, window] for values in (strips.low, strips.high, strips.low_z, strips.high_z))
-    n_x, n_z, *sums = np.nansum(strips.sums[:, which, window], axis=2)
-    x_m, z_m = strips.middle[which].T
+    (n_x, n_z, *sums), (x_m, z_m) = np.nansum(strips.sums[:, which, window], axis=2), strips.middle[which].T
     at = (np.arange(STRIPS) - (STRIPS - 1) / 2) * pitch
     (low_slope, low_off), (high_slope, high_off) = (_lines(at, ends) for ends in (low, high))
     ends_z = np.stack([_mean(low_z), _mean(high_z)])
@@ -132,9 +144,6 @@ def _rounded(seen: Slices, circle: Circles, x_m: Values, z_m: Values) -> Slices:
                    high_m=either(middle + circle.radius_m, seen.high_m), deep_m=either(deep, seen.deep_m),
                    touch_m=either(widest, seen.touch_m), lean=either(level, seen.lean),
                    chord=np.where(circle.cap, np.pi / 2, either(level, seen.chord)))
-
-
-Patch: TypeAlias = tuple[int, Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]
 
 
 def _patches(segments: Segments) -> list[Patch]:

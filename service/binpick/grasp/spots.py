@@ -59,6 +59,8 @@ class Patch:
     def of_cup(self, number: int) -> "Patch":
         """One cup's places."""
         mine = self.cup == number
+        if mine.all():
+            return self
         return replace(self, local=self.local[:, mine], own=self.own[:, mine], place=self.place[:, mine], cup=self.cup[mine],
                        lip=self.lip[mine])
 
@@ -96,8 +98,8 @@ def _peaks(labels: Labels, cell: int) -> tuple[Int32[np.ndarray, "n 2"], Float32
     inner[1:] &= labels[1:] == labels[:-1]
     distance = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5)
     highest = cv2.dilate(distance, np.ones((7, 7), dtype=np.uint8))
-    found = np.argwhere((distance >= highest) & (distance > 2))
-    far = distance[found[:, 0], found[:, 1]]
+    pixels = np.flatnonzero((distance >= highest) & (distance > 2))
+    found, far = np.stack(np.divmod(pixels, labels.shape[1]), axis=1), distance.ravel()[pixels]
     columns = labels.shape[1] // cell + 1
     square = found[:, 0] // cell * columns + found[:, 1] // cell
     order = np.lexsort((-far, square))

@@ -1,5 +1,8 @@
 """Suction grasps: where every lip of the tool lies on one part within its compliance, on measured points only."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
@@ -36,11 +39,27 @@ def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndar
     reasons = {"spots": len(at) + narrow, "rim_not_on_one_part": narrow}
     if not len(at):
         return [], reasons
+    # parts do not need each other; two halves, however many threads there are, so that nothing depends on their number
+    half = segments.parts[at[:, 0], at[:, 1]] % 2
+    halves = [np.flatnonzero(half == which) for which in (0, 1)]
+    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-seal") as pool:
+        tried = list(pool.map(lambda some: _tried(segments, at[some], T_bin_spot[some], tool, spacing_m, sigma_z_m), halves))
+    for _, _, more in tried:
+        reasons |= {reason: count + reasons.get(reason, 0) for reason, count in more.items()}
+    whose = np.concatenate([some[chosen] for some, (chosen, _, _) in zip(halves, tried, strict=True)])
+    grasps = [grasp for _, found, _ in tried for grasp in found]
+    return [grasps[i] for i in np.argsort(whose).tolist()], reasons
+
+
+def _tried(segments: Segments, at: Int32[np.ndarray, "n 2"], T_bin_spot: Float64[np.ndarray, "n 4 4"], tool: SuctionTool,
+           spacing_m: float, sigma_z_m: Float32[np.ndarray, "h w"],
+           ) -> tuple[Int64[np.ndarray, "k"], list[Grasp], dict[str, int]]:
+    """Which spots seal, the grasps there, and how many fell out for which reason."""
     patch = patches(segments, at, T_bin_spot, tool.cups, spacing_m)
     for _ in tool.cups[:CENTRINGS]:
         patch, T_bin_spot = centred(patch, T_bin_spot)
-    held = on_one_part(patch)
-    reasons["rim_not_on_one_part"] += int((~held).sum())
+    held = np.flatnonzero(on_one_part(patch))
+    reasons = {"rim_not_on_one_part": len(at) - len(held)}
     at, T_bin_spot, patch = at[held], T_bin_spot[held], patch.take(held)
     fit = seal(patch)
     limit_m = SEAL_SHARE * tool.compliance_m
@@ -50,8 +69,7 @@ def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndar
     reasons |= {"no_seal": int((~sealed).sum()), "tilt": int((sealed & ~upright).sum())}
     chosen = np.flatnonzero(sealed & upright)
     grasps = _grasps(chosen, segments, at, fit, patch, normal, T_bin_spot, tool, sigma_z_m)
-    reasons["sealed"] = len(grasps)
-    return grasps, reasons
+    return held[chosen], grasps, reasons | {"sealed": len(grasps)}
 
 
 def _turned(segments: Segments, at: Int32[np.ndarray, "n 2"], tool: SuctionTool,

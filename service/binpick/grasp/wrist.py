@@ -17,12 +17,18 @@ def equivalents(grasp: Grasp, tool: Tool) -> list[Grasp]:
     Of turns after which every body of the tool stands where it stood, the first is enough.
     """
     found, stances = [], set()
-    for turn, stance in _turns(tool):
-        T_bin_tcp = grasp.T_bin_tcp @ _about_z(turn) if turn else grasp.T_bin_tcp
+    for T_turn, stance in _turns(tool):
+        T_bin_tcp = grasp.T_bin_tcp if T_turn is None else grasp.T_bin_tcp @ T_turn
         if stance not in stances and _within(T_bin_tcp, tool.wrist.limits_rad):
             stances.add(stance)
-            found.append(replace(grasp, T_bin_tcp=T_bin_tcp) if turn else grasp)
+            found.append(grasp if T_turn is None else replace(grasp, T_bin_tcp=T_bin_tcp))
     return found
+
+
+def limited(tool: Tool) -> bool:
+    """Whether there are headings to which the robot cannot turn the tool."""
+    low, high = tool.wrist.limits_rad
+    return high - low < 2 * np.pi
 
 
 def _within(T_bin_tcp: Transform, limits_rad: tuple[float, float]) -> bool:
@@ -33,13 +39,13 @@ def _within(T_bin_tcp: Transform, limits_rad: tuple[float, float]) -> bool:
 
 
 @functools.lru_cache(maxsize=16)
-def _turns(tool: Tool) -> tuple[tuple[float, int], ...]:
-    """The turns of a symmetric tool, smallest first, each with a number that equal stances of its bodies share."""
+def _turns(tool: Tool) -> tuple[tuple[Transform | None, int], ...]:
+    """The turns of a symmetric tool, smallest first (None: as it is), each with a number that equal stances share."""
     count = tool.wrist.symmetry
     steps = sorted(range(count), key=lambda step: (min(step, count - step), step))
     seen: dict[object, int] = {}
     turns = [2 * np.pi * step / count for step in steps]
-    return tuple((turn, seen.setdefault(_stance(tool, turn), len(seen))) for turn in turns)
+    return tuple((_about_z(turn) if turn else None, seen.setdefault(_stance(tool, turn), len(seen))) for turn in turns)
 
 
 def _stance(tool: Tool, turn: float) -> object:

@@ -6,13 +6,10 @@ is measured a pixel off, or as a ramp, does not hide what it separates.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from binpick.data import Labels, Mask
 from binpick.scene.surface import Surface
@@ -20,62 +17,55 @@ from binpick.scene.surface import Surface
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Rows and columns of the ways: right, down, and both diagonals."""
 
-Grid = tuple[slice, slice]
-Field = Float32[np.ndarray, "h w"]
-Planes = Float32[np.ndarray, "3 h w"]
 Integers = Int64[np.ndarray, "n"]
 Values = Float64[np.ndarray, "n"]
+Field = Float32[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ways:
-    """All ways of one direction: what lies at their start, middle and end, and the surface between.
+    """All ways of one direction between pixels of interest: the pixels at their start, middle and end, and what lies between.
 
-    `step_m` is how far the end lies above the start's surface; `bend_m` is positive at concave folds. Both are defined where
-    `known` holds. `sigma_m` is the lesser depth noise of the two ends.
+    `step_m` is how far the end lies above the start's surface; `bend_m` is positive at concave folds. `sigma_m` is the lesser
+    depth noise of the two ends.
     """
 
-    start: Grid
-    middle: Grid
-    end: Grid
-    known: Bool[np.ndarray, "h w"]
+    start: Integers
+    middle: Integers
+    end: Integers
     step_m: Field
     bend_m: Field
     sigma_m: Field
 
 
 def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
-    """The ways of all directions, `half_px` pixels to either side of their middle."""
-    xyz, normal = (np.ascontiguousarray(field.transpose(2, 0, 1)) for field in (surface.xyz, surface.normal))
-    offset: Field = np.einsum("khw,khw->hw", xyz, normal)
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-ways") as pool:
-        return list(pool.map(partial(_ways, xyz, normal, offset, surface.sigma_z_m, of_interest, half_px), DIRECTIONS))
-
-
-def _ways(xyz: Planes, normal: Planes, offset: Field, sigma_z_m: Field, of_interest: Mask, half_px: int,
-          direction: tuple[int, int]) -> Ways:
-    down, right = (sign * (half_px if not all(direction) else max(1, round(half_px / 2**0.5))) for sign in direction)
-    start, middle, end = _grids(down, right, of_interest.shape)
-    # how far the end lies above the start's tangent plane, and the start above the end's; both halved
-    above, below = np.negative(offset[start]), np.negative(offset[end])
-    product = np.empty_like(above)
-    for plane, slope in zip(xyz, normal, strict=True):
-        above += np.multiply(slope[start], plane[end], out=product)
-        below += np.multiply(slope[end], plane[start], out=product)
-    above *= np.float32(0.5)
-    below *= np.float32(0.5)
-    return Ways(start, middle, end, of_interest[start] & of_interest[end], above - below, np.add(above, below, out=product),
-                np.minimum(sigma_z_m[start], sigma_z_m[end]))
-
-
-def _grids(down: int, right: int, shape: tuple[int, ...]) -> tuple[Grid, Grid, Grid]:
-    """Where ways start, their middles and their ends, for a step to either side."""
-    rows, cols = shape
-    aside = abs(right)
-    middle = (slice(down, rows - down), slice(aside, cols - aside))
-    start = (slice(0, rows - 2 * down), slice(aside - right, cols - aside - right))
-    end = (slice(2 * down, rows), slice(aside + right, cols - aside + right))
-    return start, middle, end
+    """The ways of all directions, `half_px` pixels to either side of their middle, whose both ends are of interest."""
+    rows, cols = of_interest.shape
+    pixels = np.flatnonzero(of_interest)
+    xyz, normal = (np.ascontiguousarray(field.reshape(-1, 3)[pixels].T) for field in (surface.xyz, surface.normal))
+    offset: Field = np.einsum("kn,kn->n", xyz, normal)
+    sigma_m = surface.sigma_z_m.ravel()[pixels]
+    # each pixel's place among those of interest, -1 for others, with a frame as wide as ways are long
+    wide = 2 * half_px
+    place = np.full((rows + wide, cols + 2 * wide), -1)
+    place[:rows, wide:-wide][of_interest] = np.arange(len(pixels))
+    framed = pixels + pixels // cols * (2 * wide) + wide
+    found = []
+    for direction in DIRECTIONS:
+        down, right = (sign * (half_px if not all(direction) else max(1, round(half_px / 2**0.5))) for sign in direction)
+        there = place.ravel()[framed + 2 * (down * place.shape[1] + right)]
+        start = np.flatnonzero(there >= 0)
+        end = there[start]
+        # how far the end lies above the start's tangent plane, and the start above the end's; both halved
+        above, below = np.negative(offset[start]), np.negative(offset[end])
+        for plane, slope in zip(xyz, normal, strict=True):
+            above += slope[start] * plane[end]
+            below += slope[end] * plane[start]
+        above *= np.float32(0.5)
+        below *= np.float32(0.5)
+        found.append(Ways(pixels[start], pixels[start] + down * cols + right, pixels[end], above - below, above + below,
+                          np.minimum(sigma_m[start], sigma_m[end])))
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,9 +103,10 @@ def contacts(regions: Labels, along: list[Ways]) -> Contacts:
 
 def _crossing(regions: Labels, along: list[Ways]) -> Iterator[tuple[Integers, Integers, Values, Values]]:
     """Of each way from one region to another: where it starts, where it ends, the step and the bend."""
+    flat = regions.ravel()
     for way in along:
-        start, end = regions[way.start], regions[way.end]
-        place = np.flatnonzero(way.known & (start != end) & (start > 0) & (end > 0))
-        p, q = (labels.ravel()[place].astype(np.int64) for labels in (start, end))
-        step, bend = (field.ravel()[place].astype(np.float64) for field in (way.step_m, way.bend_m))
+        start, end = flat[way.start], flat[way.end]
+        crosses = np.flatnonzero((start != end) & (start > 0) & (end > 0))
+        p, q = (labels[crosses].astype(np.int64) for labels in (start, end))
+        step, bend = (values[crosses].astype(np.float64) for values in (way.step_m, way.bend_m))
         yield p, q, step, bend

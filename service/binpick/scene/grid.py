@@ -67,16 +67,15 @@ def spacing(surface: Surface, of_interest: Mask) -> float:
 
 def _cuts(along: list[Ways], of_interest: Mask, settings: SegmentSettings) -> tuple[Mask, Mask]:
     """Pixels at steps and concave folds, and those at convex folds: the middles of ways that cross one."""
-    concave, convex = np.zeros(of_interest.shape, dtype=bool), np.zeros(of_interest.shape, dtype=bool)
+    concave, convex = np.zeros(of_interest.size, dtype=bool), np.zeros(of_interest.size, dtype=bool)
     fold = np.float32(HALF_WAY_M * np.sin(settings.crease_rad))
     for way in along:
         noise = np.float32(SIGMAS) * way.sigma_m
-        with np.errstate(invalid="ignore"):
-            stepped = np.abs(way.step_m) > np.maximum(np.float32(settings.jump_m), noise)
-            least = np.maximum(fold, np.float32(0.7) * noise)
-            concave[way.middle] |= way.known & (stepped | (way.bend_m > least))
-            convex[way.middle] |= way.known & (way.bend_m < -least)
-    return concave, convex
+        stepped = np.abs(way.step_m) > np.maximum(np.float32(settings.jump_m), noise)
+        least = np.maximum(fold, np.float32(0.7) * noise)
+        concave[way.middle[stepped | (way.bend_m > least)]] = True
+        convex[way.middle[way.bend_m < -least]] = True
+    return concave.reshape(of_interest.shape), convex.reshape(of_interest.shape)
 
 
 def _without_specks(mask: Mask, least: int) -> Mask:

@@ -54,23 +54,27 @@ def _inside(surface: Surface, model: Bin) -> Mask:
     """Measured points with a normal, above the floor and not of a wall."""
     length, width, _ = model.inner_size_m
     side = length / 2 - WALL_M, width / 2 - WALL_M
-    inside = cv2.inRange(surface.xyz, (-side[0], -side[1], LEAST_M), (*side, np.inf)) > 0
+    inside = np.asarray(cv2.inRange(surface.xyz, (-side[0], -side[1], LEAST_M), (*side, np.inf)) > 0)
+    place = np.flatnonzero(inside)
+    z, across = surface.xyz.reshape(-1, 3)[place, 2], surface.normal.reshape(-1, 3)[place, 0]
     with np.errstate(invalid="ignore"):
-        above = surface.xyz[..., 2] > 3 * surface.sigma_z_m
-    return np.asarray(inside & above & np.isfinite(surface.normal[..., 0]))
+        inside.ravel()[place] = (z > 3 * surface.sigma_z_m.ravel()[place]) & np.isfinite(across)
+    return inside
 
 
 def _drop_small(labels: Labels, least: int) -> Labels:
     """Only segments of at least `least` pixels, counted anew from 1 in reading order."""
-    sizes = np.bincount(labels.ravel(), minlength=1)
+    place = np.flatnonzero(labels)
+    label = labels.ravel()[place]
+    sizes = np.bincount(label, minlength=1)
     # the first pixel of each: written backwards, the first one is written last
-    first, place = np.zeros(len(sizes), dtype=np.int64), np.flatnonzero(labels)[::-1]
-    first[labels.ravel()[place]] = place
+    first = np.zeros(len(sizes), dtype=np.int64)
+    first[label[::-1]] = place[::-1]
     keep = np.flatnonzero(sizes >= least)
-    keep = keep[keep > 0]
     renumbered = np.zeros(len(sizes), dtype=np.int32)
     renumbered[keep[np.argsort(first[keep])]] = np.arange(1, len(keep) + 1, dtype=np.int32)
-    kept: Labels = renumbered[labels]
+    kept: Labels = np.zeros(labels.shape, dtype=np.int32)
+    kept.ravel()[place] = renumbered[label]
     return kept
 
 

@@ -4,9 +4,7 @@ On a plane 1/z, and so disparity, is affine in the pixel coordinates; a plane fi
 even. Each pixel takes the fit of the window around it, of five, that fits best, so a window across an edge never wins.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -18,18 +16,19 @@ from binpick.geometry import Transform
 
 RADIUS = 3
 """Half side of a fit window, half-resolution px: 7x7 are about 8 mm at 1 m."""
-STRIPS = 6
-"""So many strips of rows are fitted one by one."""
 SUPPORT = 0.5
 """Least share of measured pixels in a fit window."""
 WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RADIUS, RADIUS))
 """Where the fit windows around a pixel are centred (row, column): on it, or with it at their corner."""
-
+_CENTRES = np.zeros((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=np.uint8)
+_CENTRES[tuple(np.array(WINDOWS).T + RADIUS)] = 1
+_WEIGHTS = np.full(256, np.nan, dtype=np.float32)
+"""By the number of measured pixels in a block: their share, or NaN, which passes through every division."""
+_WEIGHTS[2:5] = 0.5, 0.75, 1.0
 
 Box = tuple[geometry.Vector, geometry.Vector]
 """Lowest and highest corner."""
 Field = Float32[np.ndarray, "h w"]
-Rows = Float32[np.ndarray, "r w"]
 Values = Float32[np.ndarray, "n"]
 
 
@@ -47,7 +46,8 @@ class Surface:
 
     def cut(self, box: tuple[slice, slice]) -> "Surface":
         """Its rows and columns in a box."""
-        return Surface(self.xyz[box], self.normal[box], self.sigma_z_m[box], self.eyes)
+        xyz, normal, sigma_z_m = (np.ascontiguousarray(field[box]) for field in (self.xyz, self.normal, self.sigma_z_m))
+        return Surface(xyz, normal, sigma_z_m, self.eyes)
 
 
 def surface(depth: Depth, rectified: Rectified, T_bin_camera: Transform, box_bin: Box | None = None) -> Surface:
@@ -87,9 +87,8 @@ def _half(depth: Depth) -> tuple[Field, Field]:
     rows, cols = depth.disparity.shape[0] // 2, depth.disparity.shape[1] // 2
     known = depth.measured[:2 * rows, :2 * cols]
     mask = np.ascontiguousarray(known).view(np.uint8)
-    weight = cv2.resize(mask.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
-    # 0.49: two of four; NaN marks the rest, and passes through every division
-    weight[weight < 0.49] = np.nan
+    # the mean of fours is how many of the four are measured
+    weight = cv2.LUT(cv2.resize(mask * np.uint8(4), (cols, rows), interpolation=cv2.INTER_AREA), _WEIGHTS)
     values = (cv2.copyTo(field[:2 * rows, :2 * cols], mask) for field in (depth.disparity, depth.sigma_px))
     disparity, sigma_px = (cv2.resize(value, (cols, rows), interpolation=cv2.INTER_AREA) / weight for value in values)
     return disparity, sigma_px
@@ -99,26 +98,30 @@ def _planes(disparity: Field, wanted: Mask) -> tuple[Int64[np.ndarray, "n"], Val
     """Those wanted pixels, in reading order, whose best plane has support: its slopes per half-resolution px and its level."""
     cols = disparity.shape[1]
     box = around(wanted, 2 * RADIUS)
-    near = np.ascontiguousarray(disparity[box])
-    slope_u, slope_v, level, misfit = (field.ravel() for field in _fits(near, np.isfinite(near)))
-    width = near.shape[1]
-    row, col = np.nonzero(wanted[box])
-    # what the windows reach beyond the window's border has no support
-    framed = np.pad(misfit.reshape(near.shape), RADIUS, constant_values=np.inf).ravel()
-    at = (row + RADIUS) * (width + 2 * RADIUS) + col + RADIUS
-    best, source = framed[at], row * width + col
-    centre = source.copy()
-    for dv, du in WINDOWS[1:]:
-        error = framed[at + dv * (width + 2 * RADIUS) + du]
-        better = error < best
-        source[better] = centre[better] + dv * width + du
-        np.minimum(best, error, out=best)
-    found = np.isfinite(best)
-    source, row, col = source[found], row[found], col[found]
-    a, b = slope_u[source], slope_v[source]
-    down, right = source // width - row, source % width - col
+    asked = wanted[box]
+    centres = np.flatnonzero(cv2.dilate(asked.view(np.uint8), _CENTRES, borderType=cv2.BORDER_CONSTANT, borderValue=0))
+    slope_u, slope_v, level, misfit = _fits(np.ascontiguousarray(disparity[box]), centres)
+    # which fit is centred where: what the windows reach beyond the border has none, and the last one, added, no support
+    width, wide = asked.shape[1], asked.shape[1] + 2 * RADIUS
+    fit_at = np.full((len(asked) + 2 * RADIUS) * wide, -1, dtype=np.int32)
+    fit_at[_framed(centres, width)] = np.arange(len(centres), dtype=np.int32)
+    misfit = np.append(misfit, np.float32(np.inf))
+    pixels = np.flatnonzero(asked)
+    at = _framed(pixels, width)
+    fits = [fit_at[at + dv * wide + du] for dv, du in WINDOWS]
+    best = np.stack([misfit[fit] for fit in fits], axis=1).argmin(axis=1)
+    fit = np.choose(best, fits)
+    found = np.flatnonzero(misfit[fit] < np.inf)
+    fit, (row, col) = fit[found], np.divmod(pixels[found], width)
+    a, b, (down, right) = slope_u[fit], slope_v[fit], np.array(WINDOWS)[best[found]].T
     place = (row + box[0].start) * cols + col + box[1].start
-    return place, a, b, (level[source] - a * right - b * down).astype(np.float32)
+    return place, a, b, (level[fit] - a * right - b * down).astype(np.float32)
+
+
+def _framed(pixels: Int64[np.ndarray, "n"], width: int) -> Int64[np.ndarray, "n"]:
+    """Pixels of a picture that is this wide in one that has a frame of RADIUS around it."""
+    framed: Int64[np.ndarray, "n"] = pixels + pixels // width * (2 * RADIUS) + RADIUS * (width + 2 * RADIUS + 1)
+    return framed
 
 
 def around(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
@@ -131,31 +134,20 @@ def around(mask: Mask, margin: int = 0) -> tuple[slice, slice]:
     return high, wide
 
 
-def _fits(disparity: Field, known: Mask) -> tuple[Field, Field, Field, Field]:
-    """Least-squares planes of the windows centred on every pixel, by box sums; misfit is inf without support.
+def _fits(disparity: Field, centres: Int64[np.ndarray, "n"]) -> tuple[Values, Values, Values, Values]:
+    """Least-squares planes of the windows centred on some pixels, by box sums; misfit is inf without support.
 
     float32 suffices around the median disparity: with |d| < 40 px the misfit, a difference of squares, is good to 1e-4 px².
-    Strips stay in the processor's cache; they are the same however many threads work on them.
     """
+    known = np.isfinite(disparity)
     few = disparity[::4, ::4][known[::4, ::4]]
     mid = np.float32(np.median(few) if few.size else 0)
     d, w = cv2.copyTo(disparity - mid, known.view(np.uint8)), known.astype(np.float32)
-    edges = np.linspace(0, len(d), STRIPS + 1).astype(int).tolist()
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-fits") as pool:
-        strips = list(pool.map(partial(_strip, d, w), edges[:-1], edges[1:]))
-    a, b, level, misfit = (np.concatenate(fields) for fields in zip(*strips, strict=True))
-    return a, b, level + mid, misfit
-
-
-def _strip(d: Field, w: Field, begin: int, end: int) -> tuple[Rows, Rows, Rows, Rows]:
-    """The planes of some rows' windows; `d` is 0 where its weight `w` is."""
-    first = max(0, begin - RADIUS)
-    d, w, rows = d[first:end + RADIUS], w[first:end + RADIUS], slice(begin - first, end - first)
     ones = np.ones(2 * RADIUS + 1, dtype=np.float32)
     ramp = np.arange(-RADIUS, RADIUS + 1, dtype=np.float32)
 
-    def window(field: Field, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Rows:
-        summed: Rows = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)[rows]
+    def window(field: Field, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Values:
+        summed: Values = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT).ravel()[centres]
         return summed
 
     n = np.maximum(window(w, ones, ones), 1)
@@ -172,4 +164,4 @@ def _strip(d: Field, w: Field, begin: int, end: int) -> tuple[Rows, Rows, Rows, 
     a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
     misfit = np.maximum(dd - a * ud - b * vd, np.float32(0))
     misfit[~usable] = np.inf
-    return a, b, mean_d - a * mean_u - b * mean_v, misfit
+    return a, b, mean_d - a * mean_u - b * mean_v + mid, misfit

@@ -1,11 +1,10 @@
 """Disparity to XYZ: z = f b / d, on the window's pixel grid, in the camera's frame."""
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
 
 from binpick import geometry
 from binpick.data import Depth, OrganisedCloud, Rectified, frozen
-from binpick.geometry import Transform
 
 
 def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
@@ -14,17 +13,8 @@ def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
     u = (np.arange(view.width) + (view.x - rectified.cx_px)).astype(np.float32)
     v = (np.arange(view.height) + (view.y - rectified.cy_px)).astype(np.float32)
     depth_scale = np.float32(rectified.focal_px * rectified.baseline_m)
-    z = depth_scale / depth.disparity
-    rect = np.empty((*z.shape, 3), dtype=np.float32)
-    rect[..., 2] = z
-    np.multiply(z, u[None, :] / np.float32(rectified.focal_px), out=rect[..., 0])
-    np.multiply(z, v[:, None] / np.float32(rectified.focal_px), out=rect[..., 1])
+    f, z = np.float32(rectified.focal_px), depth_scale / depth.disparity
+    rect = cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z])
     xyz = geometry.transform(rectified.T_camera_rect, rect)
     sigma_z_m = z * z * depth.sigma_px / depth_scale
     return OrganisedCloud(xyz=frozen(xyz), sigma_z_m=frozen(sigma_z_m), window=view)
-
-
-def eyes(rectified: Rectified, T_bin_camera: Transform) -> Float64[np.ndarray, "2 3"]:
-    """Where both cameras are, in the bin's frame."""
-    T_bin_rect = T_bin_camera @ rectified.T_camera_rect
-    return geometry.transform(T_bin_rect, np.array([[0.0, 0.0, 0.0], [rectified.baseline_m, 0.0, 0.0]]))

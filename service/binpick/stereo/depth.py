@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from binpick.data import Depth, Disparity, Image, Light, Mask, Rectified, frozen
+from binpick.data import Depth, Disparity, Image, Light, Mask, Rectified, Window, frozen
 from binpick.settings import StereoSettings
-from binpick.settings.stereo import Hybrid
+from binpick.settings.stereo import Hybrid, Onnx, Sgbm
 from binpick.stereo import evidence, filter, graycode, prefilter, pyramid, refine, search, shots, trust, weights
 from binpick.stereo.refine import Reach, Refined
 from binpick.stereo.strip import Strip, joined, strips
@@ -22,6 +22,8 @@ STRIP_ROWS, OVERLAP_ROWS = 248, 24
 it sees two less). Both are even, as cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same
 whoever computes it."""
 TEXTURE_PX = 7
+WARM_PX = 96
+"""Side of the images that `warm` measures; their size matters to nothing that is compiled."""
 LEAST_CONTRAST = 2
 """Grey levels between the darkest and the brightest pixel around, from which there is something to match."""
 
@@ -96,6 +98,16 @@ def _textured(disparity: Disparity, pair: Rectified) -> Mask:
     block = np.ones((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
     left, right = (cv2.morphologyEx(image, cv2.MORPH_GRADIENT, block) for image in (pair.left[:, pair.margin:], pair.right))
     return np.asarray(cv2.min(left, warp(right, disparity, pair.margin, cv2.INTER_NEAREST)) >= LEAST_CONTRAST)
+
+
+def warm(settings: StereoSettings) -> None:
+    """Compiles what `measure` needs, or finds it compiled: some seconds once, that no cycle must wait for."""
+    known = settings if not isinstance(settings.matcher, Onnx) else settings.model_copy(update={"matcher": Sgbm()})
+    noise = np.random.default_rng(0).integers(0, 255, (2, WARM_PX, WARM_PX), np.uint8)
+    left, right = (frozen(np.ascontiguousarray(image)) for image in noise)
+    margin = 2 * search.STEP
+    measure(Rectified(left=left, right=right, window=Window(0, 0, WARM_PX - margin, WARM_PX, 0, margin), margin=margin,
+                      focal_px=1.0, baseline_m=1.0, cx_px=0.0, cy_px=0.0, T_camera_rect=np.eye(4)), known)
 
 
 def of_shots(taken: tuple[Rectified, ...], lights: tuple[Light, ...], settings: StereoSettings) -> tuple[Rectified, Depth]:

@@ -7,12 +7,17 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
+from binpick.stereo.compiled import compiled
 from binpick.stereo.refine import Cells, Refined, mean_of_four
-from binpick.stereo.warp import warp
+from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
+Known = Bool[np.ndarray, "h w"]
 NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
 """Squared grey levels of the difference of two pixels: twice a read noise of 2, and shot noise of the brightness."""
+PER_SIGMA = (1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))).astype(np.float32)
+"""Of each grey level."""
+HALF, BEYOND = np.float32(0.5), np.float32(4096)
 MOST = 5.0
 """Differences between the images count up to so many sigma of noise: beyond, something else is seen."""
 NEAR_PX = 3
@@ -49,25 +54,83 @@ class Evidence:
 
 def gather(matched: Disparity, refined: Refined, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified) -> Evidence:
     """The evidence on matched disparities, px relative to the window's smallest, NaN: not matched."""
-    known = np.isfinite(matched)
     left = rectified.left[:, rectified.margin:]
     pixels = np.empty((len(OF_PIXELS), *matched.shape), np.float32)
     put = dict(zip(OF_PIXELS, pixels, strict=True))
-    flat, deep = (np.where(known, matched, np.float32(value)) for value in (0, 4096))
+    known, flat, deep = _bounds(matched)
     high, low = flat, deep
     for name in ("spread_near", "spread"):          # 3x3 of 3x3 is 5x5
         high, low = cv2.dilate(high, AROUND), cv2.erode(low, AROUND)
-        np.clip(high - low, 0, MOST_JUMP_PX, out=put[name])
+        _range(high, low, put[name])
     low = np.asarray(cv2.min(low, high), np.float32)
-    two = np.asarray((high - low > TWO_SURFACES_PX) & known)
-    compare = _Comparison(left, rectified.right, rectified.margin)
-    seen = compare.seen(flat)
-    cv2.blur(compare.unlike(seen), (NEAR_PX, NEAR_PX), dst=put["mismatch"])
-    difference = cv2.blur(compare.unlike(compare.seen(high)) - compare.unlike(compare.seen(low)), (NEAR_PX, NEAR_PX))
-    np.negative(difference, out=difference, where=matched + matched <= high + low)
-    np.multiply(difference, two, out=put["rival"])
+    seen, mismatch, difference = _compared(left, rectified.right, rectified.margin, flat, high, low, PER_SIGMA)
+    cv2.blur(mismatch, (NEAR_PX, NEAR_PX), dst=put["mismatch"])
+    two = _rival(cv2.blur(difference, (NEAR_PX, NEAR_PX)), flat, known, high, low, put["rival"])
     np.fmin(refined.departure, 2, out=put["departure"])
     return Evidence(pixels, _of_cells(left, seen, known, refined, confidence), two)
+
+
+@compiled
+def _bounds(matched: Disparity) -> tuple[Known, Field, Field]:
+    """What is matched; the matches with 0, and with BEYOND, where there is none."""
+    known, flat, deep = np.empty(matched.shape, np.bool_), np.empty_like(matched), np.empty_like(matched)
+    for v in range(len(matched)):
+        for u in range(matched.shape[1]):
+            known[v, u] = not np.isnan(matched[v, u])
+            flat[v, u] = matched[v, u] if known[v, u] else np.float32(0)
+            deep[v, u] = matched[v, u] if known[v, u] else BEYOND
+    return known, flat, deep
+
+
+@compiled
+def _range(high: Field, low: Field, spread: Field) -> None:
+    """From the lowest to the highest match around; none where nothing is matched."""
+    for v in range(len(high)):
+        for u in range(high.shape[1]):
+            spread[v, u] = min(max(high[v, u] - low[v, u], np.float32(0)), np.float32(MOST_JUMP_PX))
+
+
+@compiled
+def _rival(difference: Field, flat: Field, known: Known, high: Field, low: Field, rival: Field) -> Known:
+    """How much better the surface explains the pixel that it was not matched to; where there are two."""
+    two = np.empty(flat.shape, np.bool_)
+    for v in range(len(flat)):
+        for u in range(flat.shape[1]):
+            two[v, u] = known[v, u] and high[v, u] - low[v, u] > np.float32(TWO_SURFACES_PX)
+            better = difference[v, u] if flat[v, u] + flat[v, u] > high[v, u] + low[v, u] else -difference[v, u]
+            rival[v, u] = better if two[v, u] else np.float32(0)
+    return two
+
+
+@compiled
+def _compared(left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int, flat: Field, high: Field, low: Field,
+              per_sigma: Float32[np.ndarray, "256"]) -> tuple[Image, Field, Field]:
+    """The right image as the left view sees it at `flat`, how unlike they are there (sigmas of noise, at most MOST), and how
+    much more so at `high` than at `low`."""
+    seen, mismatch, difference = np.empty_like(left), np.empty_like(flat), np.empty_like(flat)
+    line, there = np.empty(right.shape[1] + 1, np.float32), np.empty(left.shape[1], np.float32)
+    other = np.empty_like(there)
+    for v in range(left.shape[0]):
+        lengthened(right[v], line)
+        sample(line, high[v], margin, there)
+        _unlike(left[v], there, per_sigma, difference[v])
+        sample(line, low[v], margin, there)
+        _unlike(left[v], there, per_sigma, other)
+        for u in range(len(other)):
+            difference[v, u] -= other[u]
+        sample(line, flat[v], margin, there)
+        _unlike(left[v], there, per_sigma, mismatch[v])
+        for u in range(len(there)):
+            seen[v, u] = np.uint8(there[u])
+    return seen, mismatch, difference
+
+
+@compiled
+def _unlike(left: UInt8[np.ndarray, "w"], there: Line, per_sigma: Float32[np.ndarray, "256"], unlike: Line) -> None:
+    """Of a row, and `there` rounded to whole grey levels."""
+    for u in range(len(left)):
+        there[u] = np.floor(there[u] + HALF)
+        unlike[u] = min(abs(np.float32(left[u]) - there[u]) * per_sigma[left[u]], np.float32(MOST))
 
 
 def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined: Refined,
@@ -95,20 +158,3 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
 def _brighter(left: Cells, right: Cells) -> Cells:
     """Log of how much brighter the left view is than the right one."""
     return np.asarray(np.log((left + np.float32(DARK)) / (right + np.float32(DARK))), np.float32)
-
-
-class _Comparison:
-    """How unlike the two images are at a disparity, in sigmas of noise, at most MOST."""
-
-    def __init__(self, left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int) -> None:
-        self._left, self._right, self._margin = left, right, margin
-        table = 1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))
-        self._per_sigma = cv2.LUT(left, table.astype(np.float32))
-
-    def seen(self, disparity: Field) -> Image:
-        """The right image as the left view sees it."""
-        return warp(self._right, disparity, self._margin, cv2.INTER_LINEAR)
-
-    def unlike(self, seen: Image) -> Field:
-        unlike = cv2.multiply(cv2.absdiff(self._left, seen), self._per_sigma, dtype=cv2.CV_32F)
-        return np.asarray(cv2.min(unlike, MOST), np.float32)

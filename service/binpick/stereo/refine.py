@@ -13,15 +13,19 @@ import numpy as np
 from jaxtyping import Float32
 
 from binpick.data import Disparity, Image, Rectified
-from binpick.stereo.warp import warp
+from binpick.stereo.compiled import compiled
+from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
 Cells = Float32[np.ndarray, "rows cols"]
-MOST_STEP_PX = 0.25
-"""A single correction counts no further: beyond that the image is not straight, or the match is wrong."""
-STRONG = 200.0
+ZERO, QUARTER, ONE = np.float32(0), np.float32(0.25), np.float32(1)
+MOST_STEP = np.float32(0.25)
+"""Px; a single correction counts no further: beyond that the image is not straight, or the match is wrong."""
+LEAST_SLOPE = np.float32(4e-3)
+"""Squared grey levels per px, of four pixels together, from which the images say anything."""
+STRONG = np.float32(200)
 """Squared grey levels per px from which an edge's weight grows no further: a part's outline is no better than a dot."""
-LEAST_WEIGHT = 0.02
+LEAST_WEIGHT = np.float32(0.02)
 """What a cell without any slope still weighs: it says what the matcher said."""
 ASIDE = 2.0
 """How many times better a window aside must fit to have the same say as the one around the pixel."""
@@ -71,18 +75,27 @@ def refine(matched: Disparity, rectified: Rectified, reach: Reach) -> Refined:
     middle = rectified.window.num_disparities / 2
     planes = _fits(cells, reach.radius, middle)
     vote = _vote(planes, reach.radius, middle)
-    shape = matched.shape
-    v, u = (np.resize(np.array([-0.25, 0.25], np.float32), n) for n in shape)
-    plane = spread(np.where(cells.weight > 0, vote.level, np.float32(np.nan)), shape)
-    plane += spread(vote.slope_u, shape) * u
-    plane += spread(vote.slope_v, shape) * v[:, None]
-    departure = np.abs(plane - matched)
-    with np.errstate(invalid="ignore"):
-        disparity = np.where(departure < TRUSTED_PX, plane, matched)
+    disparity, departure = _believed(matched, cells.weight, vote.level, vote.slope_u, vote.slope_v)
     # not cv2.magnitude: its last bit depends on where in memory the arrays lie
     steepness = np.minimum(np.sqrt(vote.slope_u * vote.slope_u + vote.slope_v * vote.slope_v) / 2, np.float32(1))
     bend = _bend(vote.slope_u, vote.slope_v, reach.radius)
     return Refined(disparity, departure, vote.misfit, steepness, bend, planes.support)
+
+
+@compiled
+def _believed(matched: Disparity, weight: Cells, level: Cells, slope_u: Cells, slope_v: Cells) -> tuple[Disparity, Disparity]:
+    """The planes at the pixels' centres, or the match where that contradicts it, and how far off they are; NaN: no match."""
+    rows, cols = weight.shape
+    disparity, departure = np.empty_like(matched), np.empty_like(matched)
+    for v in range(matched.shape[0]):
+        row, down = min(v // 2, rows - 1), -QUARTER if v % 2 == 0 else QUARTER
+        for u in range(matched.shape[1]):
+            col, aside = min(u // 2, cols - 1), -QUARTER if u % 2 == 0 else QUARTER
+            plane = level[row, col] + slope_u[row, col] * aside + slope_v[row, col] * down
+            off = abs(plane - matched[v, u]) if weight[row, col] > 0 else np.float32(np.nan)
+            departure[v, u] = off
+            disparity[v, u] = plane if off < np.float32(TRUSTED_PX) else matched[v, u]
+    return disparity, departure
 
 
 def _bend(slope_u: Cells, slope_v: Cells, radius: int) -> Cells:
@@ -101,22 +114,62 @@ class _Corrected:
 
 
 def _cells(matched: Disparity, rectified: Rectified, band_px: int) -> _Corrected:
-    margin = rectified.margin
-    known = np.isfinite(matched)
-    filled = np.where(known, matched, np.float32(0))
-    left, right = _band(rectified.left[:, margin:], band_px), _band(rectified.right, band_px)
-    warped = warp(cv2.merge([right, _slope(right)]), filled, margin, cv2.INTER_LINEAR)
-    rise = (_slope(left) + warped[..., 1]) * np.float32(0.5)
-    rise *= known
-    square = rise * rise
-    g2, ge, g2d, share, plain = (mean_of_four(field) for field in (
-        square, rise * (left - warped[..., 0]), square * filled, known.astype(np.float32), filled))
-    step = np.clip(ge / np.maximum(g2, np.float32(1e-3)), -MOST_STEP_PX, MOST_STEP_PX)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        before = np.where(g2 > 1e-3, g2d / g2, plain / share)
-    seen = share > 0.4
-    weight = np.where(seen, g2 / (1 + g2 / np.float32(STRONG)) + np.float32(LEAST_WEIGHT), np.float32(0))
-    return _Corrected(np.where(seen, before - step, np.float32(0)), weight)
+    left, right = _band(rectified.left[:, rectified.margin:], band_px), _band(rectified.right, band_px)
+    return _Corrected(*_corrected(matched, left, right, rectified.margin))
+
+
+@compiled
+def _corrected(matched: Disparity, left: Field, right: Float32[np.ndarray, "h whole_w"], margin: int) -> tuple[Cells, Cells]:
+    """Of each 2x2 px, the disparity after one step of registration and its weight."""
+    rows, cols = matched.shape[0] // 2, matched.shape[1] // 2
+    disparity, weight = np.zeros((rows, cols), np.float32), np.zeros((rows, cols), np.float32)
+    sums = np.empty((5, matched.shape[1]), np.float32)
+    for row in range(rows):
+        sums[:] = 0
+        for v in (2 * row, 2 * row + 1):
+            _registered(matched[v], left[v], right[v], margin, sums)
+        for col in range(cols):
+            g2, ge = sums[0, 2 * col] + sums[0, 2 * col + 1], sums[1, 2 * col] + sums[1, 2 * col + 1]
+            g2d = sums[2, 2 * col] + sums[2, 2 * col + 1]
+            known, plain = sums[3, 2 * col] + sums[3, 2 * col + 1], sums[4, 2 * col] + sums[4, 2 * col + 1]
+            if known > 1:
+                step = min(max(ge / max(g2, LEAST_SLOPE), -MOST_STEP), MOST_STEP)
+                disparity[row, col] = (g2d / g2 if g2 > LEAST_SLOPE else plain / known) - step
+                mean = g2 * np.float32(0.25)
+                weight[row, col] = mean / (1 + mean / STRONG) + LEAST_WEIGHT
+    return disparity, weight
+
+
+@compiled
+def _registered(matched: Line, left: Line, right: Float32[np.ndarray, "whole_w"], margin: int, sums: Float32[np.ndarray, "5 w"],
+                ) -> None:
+    """A row's g², g e, g² d, count and d, added to `sums`."""
+    line, slopes = np.empty(len(right) + 1, np.float32), np.empty(len(right) + 1, np.float32)
+    lengthened(right, line)
+    _slopes(right, slopes)
+    filled, value = np.empty(len(left), np.float32), np.empty(len(left), np.float32)
+    slope, own = np.empty(len(left), np.float32), np.empty(len(left), np.float32)
+    for u in range(len(left)):
+        filled[u] = ZERO if np.isnan(matched[u]) else matched[u]
+    sample(line, filled, margin, value)
+    sample(slopes, filled, margin, slope)
+    _slopes(left, own)
+    for u in range(len(left)):
+        known = ZERO if np.isnan(matched[u]) else ONE
+        rise = (own[u] + slope[u]) * np.float32(0.5) * known
+        sums[0, u] += rise * rise
+        sums[1, u] += rise * (left[u] - value[u])
+        sums[2, u] += rise * rise * filled[u]
+        sums[3, u] += known
+        sums[4, u] += filled[u]
+
+
+@compiled
+def _slopes(line: Line, slopes: Float32[np.ndarray, "longer"]) -> None:
+    """Grey levels per px along a row, by central differences; none at its ends."""
+    slopes[:] = 0
+    for u in range(1, len(line) - 1):
+        slopes[u] = (line[u + 1] - line[u - 1]) * np.float32(0.5)
 
 
 def mean_of_four(field: np.ndarray) -> Cells:
@@ -129,11 +182,6 @@ def _band(image: Image, band_px: int) -> Field:
     """Less the mean around."""
     band: Field = cv2.subtract(image, cv2.blur(image, (band_px, band_px)), dtype=cv2.CV_32F)
     return band
-
-
-def _slope(image: Field) -> Field:
-    """Grey levels per px along the row, by central differences."""
-    return np.asarray(cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=1, scale=0.5), np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,6 @@
 """The raw search: one function from a pair to a view's disparity, whichever the matcher."""
 
-from typing import TypeAlias
+from typing import TypeAlias, TypeGuard
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Int16
 from binpick.data import Disparity, Image
 from binpick.errors import ImageError, InputError
 from binpick.settings.stereo import Bm, Onnx, Sgbm
-from binpick.stereo import network
+from binpick.stereo import network, semiglobal
 
 SCALE = 16
 """OpenCV's disparities are integers in 1/16 px."""
@@ -24,7 +24,6 @@ MOST_BYTES = 2 << 30
 BYTES_PER_COST = 4
 """Measured on OpenCV 4.14: 231 MB for 888x600 px and 112 disparities: a cost and a sum, 16 bits each."""
 MODES = {
-    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
     "hh": cv2.STEREO_SGBM_MODE_HH,
     "hh4": cv2.STEREO_SGBM_MODE_HH4,
@@ -45,6 +44,10 @@ def search(left: Image, right: Image, num_disparities: int, matcher: Plain) -> D
     _check(left, num_disparities, matcher)
     if isinstance(matcher, Onnx):
         return _seen(network.disparity(left, right, matcher.model), num_disparities)
+    if _compiled(matcher):
+        whole = np.full(left.shape, np.nan, np.float32)
+        whole[:, num_disparities:] = _pixels(semiglobal.of_left(left, right, num_disparities, matcher), num_disparities)
+        return whole
     return _left_pass(left, right, _engine(matcher, num_disparities))
 
 
@@ -60,7 +63,14 @@ def search_right(left: Image, right: Image, num_disparities: int, matcher: Plain
     if isinstance(matcher, Onnx):
         mirrored = network.disparity(_mirror(right), _mirror(left), matcher.model)
         return np.ascontiguousarray(_seen(mirrored, num_disparities)[:, ::-1])
+    if _compiled(matcher):
+        return _inside(_pixels(semiglobal.of_right(left, right, num_disparities, matcher), num_disparities))
     return _right_pass(left, right, _engine(matcher, num_disparities))
+
+
+def _compiled(matcher: Sgbm | Bm) -> TypeGuard[Sgbm]:
+    """Whether our own loops search, or OpenCV."""
+    return isinstance(matcher, Sgbm) and matcher.mode == "3way"
 
 
 def _engine(matcher: Sgbm | Bm, num_disparities: int) -> cv2.StereoMatcher:
@@ -86,8 +96,12 @@ def _right_pass(left: Image, right: Image, engine: cv2.StereoMatcher) -> Dispari
     num_disparities = engine.getNumDisparities()
     padded = [cv2.copyMakeBorder(image, 0, 0, 0, num_disparities, cv2.BORDER_REPLICATE) for image in (right, left)]
     raw = np.asarray(cv2.ximgproc.createRightMatcher(engine).compute(*padded), dtype=np.int16)
-    found = _pixels(-raw[:, :left.shape[1]], num_disparities)
-    reach = np.arange(left.shape[1] - 1, -1, -1, dtype=np.float32)
+    return _inside(_pixels(-raw[:, :left.shape[1]], num_disparities))
+
+
+def _inside(found: Disparity) -> Disparity:
+    """A right view's, without matches in what was put beside the left image."""
+    reach = np.arange(found.shape[1] - 1, -1, -1, dtype=np.float32)
     found[found > reach] = np.nan
     return found
 

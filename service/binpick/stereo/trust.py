@@ -11,17 +11,23 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32
 
 from binpick.data import Disparity, Mask
+from binpick.stereo.compiled import compiled
 from binpick.stereo.evidence import Evidence
-from binpick.stereo.refine import mean_of_four, spread
 from binpick.stereo.weights import Model, Network
 
 LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.02, 3.0
 """Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what it was fitted on."""
 BLOCK = 1024
 """Columns that are taken through a network at a time: they stay in the cache, and so few BLAS never shares among threads."""
+QUARTER = np.float32(0.25)
+Pixels = Float32[np.ndarray, "n h w"]
+OfCells = Float32[np.ndarray, "m h2 w2"]
+Measures = Float32[np.ndarray, "n k"]
+Field = Float32[np.ndarray, "h w"]
+Vector = Float32[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,27 +40,17 @@ class Trust:
 
 def judge(evidence: Evidence, model: Model) -> Trust:
     """What the evidence says of every pixel, by what was fitted at its resolution."""
-    shape, cells = (evidence.two.shape[0], evidence.two.shape[1]), evidence.cells
-    constant = np.full(cells.shape[1:], model.wrong.constant, np.float32)
-    odds = _sum(evidence.pixels, model.wrong.pixels, spread(_sum(cells, model.wrong.cells, constant), shape))
-    means = np.concatenate([*(mean_of_four(plane)[None] for plane in evidence.pixels), cells])
-    log_sigma = spread(answer(model.sigma, means.reshape(len(means), -1)).reshape(cells.shape[1:]), shape)
-    v, u = np.nonzero(evidence.two)
-    contested = _at(evidence, v, u)
-    for field, network in ((odds, model.wrong_between), (log_sigma, model.sigma_between)):
-        field[v, u] = answer(network, contested)
+    pixels, cells, two, law = evidence.pixels, evidence.cells, evidence.two, model.wrong
+    of_cells = answer(model.sigma, _means(pixels, cells)).reshape(cells.shape[1:])
+    weights = np.float32(law.constant), np.array(law.pixels, np.float32), np.array(law.cells, np.float32)
+    odds, log_sigma = _alone(pixels, cells, *weights, of_cells)
+    contested = _contested(pixels, cells, two, int(np.count_nonzero(two)))
+    _put(odds, two, answer(model.wrong_between, contested))
+    _put(log_sigma, two, answer(model.sigma_between, contested))
     return Trust(odds, np.clip(cv2.exp(log_sigma), LEAST_SIGMA_PX, MOST_SIGMA_PX))
 
 
-def _at(evidence: Evidence, v: Int[np.ndarray, "k"], u: Int[np.ndarray, "k"]) -> Float32[np.ndarray, "n k"]:
-    """All measures at some pixels, given by row and column."""
-    rows, cols = evidence.cells.shape[1:]
-    pixel, cell = v * evidence.two.shape[1] + u, np.minimum(v >> 1, rows - 1) * cols + np.minimum(u >> 1, cols - 1)
-    return np.stack([plane.ravel().take(pixel) for plane in evidence.pixels]
-                    + [plane.ravel().take(cell) for plane in evidence.cells])
-
-
-def answer(network: Network, measures: Float32[np.ndarray, "n k"]) -> Float32[np.ndarray, "k"]:
+def answer(network: Network, measures: Measures) -> Float32[np.ndarray, "k"]:
     """The network's figure for every column of measures."""
     hidden, offsets, out = (np.array(weights, np.float32) for weights in (network.hidden, network.offsets, network.out))
     figures = np.empty(measures.shape[1], np.float32)
@@ -67,13 +63,75 @@ def answer(network: Network, measures: Float32[np.ndarray, "n k"]) -> Float32[np
     return figures
 
 
-def _sum(planes: Float32[np.ndarray, "n h w"], weights: tuple[float, ...], total: Float32[np.ndarray, "h w"],
-         ) -> Float32[np.ndarray, "h w"]:
-    """Added to `total` one plane after the other, not by BLAS: the same sum whatever the number of threads."""
-    for plane, weight in zip(planes, weights, strict=True):
-        if weight:
-            cv2.scaleAdd(plane, weight, total, dst=total)
-    return total
+@compiled
+def _means(pixels: Pixels, cells: OfCells) -> Measures:
+    """All measures of every cell: the pixels' means, then its own."""
+    n, m, rows, cols = len(pixels), *cells.shape
+    measures = np.empty((n + m, rows, cols), np.float32)
+    for k in range(n):
+        for row in range(rows):
+            top, bottom = pixels[k, 2 * row], pixels[k, 2 * row + 1]
+            for col in range(cols):
+                measures[k, row, col] = (top[2 * col] + top[2 * col + 1] + bottom[2 * col] + bottom[2 * col + 1]) * QUARTER
+    measures[n:] = cells
+    return measures.reshape((n + m, rows * cols))
+
+
+@compiled
+def _alone(pixels: Pixels, cells: OfCells, constant: np.float32, of_pixels: Vector, of_cells: Vector, log_sigma: Field,
+           ) -> tuple[Field, Field]:
+    """Log-odds and the log of sigma where one surface is seen; the last cells also on an odd last row and column."""
+    (m, rows, cols), (n, height, width) = cells.shape, pixels.shape
+    odds, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    line = np.empty(cols, np.float32)
+    for v in range(height):
+        row = min(v // 2, rows - 1)
+        line[:] = constant
+        for k in range(m):
+            _add(line, cells[k, row], of_cells[k])
+        for u in range(2 * cols):
+            odds[v, u], sigmas[v, u] = line[u // 2], log_sigma[row, u // 2]
+        if width % 2:
+            odds[v, width - 1], sigmas[v, width - 1] = line[cols - 1], log_sigma[row, cols - 1]
+        for k in range(n):
+            _add(odds[v], pixels[k, v], of_pixels[k])
+    return odds, sigmas
+
+
+@compiled
+def _add(total: Vector, values: Vector, weight: np.float32) -> None:
+    if weight != 0:
+        for i in range(len(total)):
+            total[i] += values[i] * weight
+
+
+@compiled
+def _contested(pixels: Pixels, cells: OfCells, two: Mask, count: int) -> Measures:
+    """All measures of the `count` pixels between two surfaces, in the order of rows."""
+    (m, rows, cols), n, begin = cells.shape, len(pixels), 0
+    measures, places = np.empty((n + m, count), np.float32), np.empty(two.shape[1], np.intp)
+    for v in range(len(two)):
+        found, row = 0, min(v // 2, rows - 1)
+        for u in range(two.shape[1]):
+            places[found] = u
+            found += two[v, u]
+        for i in range(found):
+            for k in range(n):
+                measures[k, begin + i] = pixels[k, v, places[i]]
+            for k in range(m):
+                measures[n + k, begin + i] = cells[k, row, min(places[i] // 2, cols - 1)]
+        begin += found
+    return measures
+
+
+@compiled
+def _put(field: Field, where: Mask, figures: Vector) -> None:
+    i = 0
+    for v in range(len(where)):
+        for u in range(where.shape[1]):
+            if where[v, u]:
+                field[v, u] = figures[i]
+                i += 1
 
 
 def believed(disparity: Disparity, trust: Trust, max_risk: float) -> Mask:
