@@ -109,28 +109,31 @@ def _compared(left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int, f
     much more so at `high` than at `low`."""
     seen, mismatch, difference = np.empty_like(left), np.empty_like(flat), np.empty_like(flat)
     line, there = np.empty(right.shape[1] + 1, np.float32), np.empty(left.shape[1], np.float32)
-    other = np.empty_like(there)
+    grey, scale, other = np.empty_like(there), np.empty_like(there), np.empty_like(there)
     for v in range(left.shape[0]):
         lengthened(right[v], line)
+        for u in range(len(grey)):
+            grey[u], scale[u] = left[v, u], per_sigma[left[v, u]]
         sample(line, high[v], margin, there)
-        _unlike(left[v], there, per_sigma, difference[v])
+        _unlike(grey, scale, there, difference[v])
         sample(line, low[v], margin, there)
-        _unlike(left[v], there, per_sigma, other)
+        _unlike(grey, scale, there, other)
         for u in range(len(other)):
             difference[v, u] -= other[u]
         sample(line, flat[v], margin, there)
-        _unlike(left[v], there, per_sigma, mismatch[v])
+        _unlike(grey, scale, there, mismatch[v])
         for u in range(len(there)):
             seen[v, u] = np.uint8(there[u])
     return seen, mismatch, difference
 
 
 @compiled
-def _unlike(left: UInt8[np.ndarray, "w"], there: Line, per_sigma: Float32[np.ndarray, "256"], unlike: Line) -> None:
-    """Of a row, and `there` rounded to whole grey levels."""
-    for u in range(len(left)):
+def _unlike(grey: Line, scale: Line, there: Line, unlike: Line) -> None:
+    """Of a row in units of `scale`, and `there` rounded to whole grey levels."""
+    for u in range(len(grey)):
         there[u] = np.floor(there[u] + HALF)
-        unlike[u] = min(abs(np.float32(left[u]) - there[u]) * per_sigma[left[u]], np.float32(MOST))
+        off = abs(grey[u] - there[u]) * scale[u]
+        unlike[u] = off if off < np.float32(MOST) else np.float32(MOST)
 
 
 def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined: Refined,
