@@ -73,8 +73,8 @@ def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettin
     disparity += low
     for field in (disparity, sigma_px):
         np.copyto(field, nan, where=~measured)
-    return Depth(disparity=frozen(disparity), fill=partial(filter.fill, views, seen, settings, guide), confidence=frozen(confidence),
-                 measured=frozen(measured), sigma_px=frozen(sigma_px))
+    return Depth(disparity=frozen(disparity), fill=partial(filter.fill, views, seen, settings, guide),
+                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(sigma_px))
 
 
 def _judged(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified, model: Model, max_risk: float,

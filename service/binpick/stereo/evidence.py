@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.compiled import compiled
-from binpick.stereo.refine import Cells, Refined, mean_of_four
+from binpick.stereo.refine import Cells, Refined
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
@@ -143,12 +143,10 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
     put = dict(zip(OF_CELLS, cells, strict=True))
     put["misfit"][:], put["slope"][:], put["bend"][:] = refined.misfit, refined.slope, refined.bend
     put["support"][:] = refined.support
-    slope = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    np.log(1 + cv2.blur(mean_of_four(slope * slope), (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
-    missing = 1 - mean_of_four(known.astype(np.float32))
+    steep, missing, *views = _means(left, seen, known)
+    np.log(1 + cv2.blur(steep, (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
     cv2.blur(missing, (WIDE_CELLS, WIDE_CELLS), dst=put["holes"])
     np.multiply(255 - confidence[:2 * rows:2, :2 * cols:2], np.float32(1 / 255), out=put["unconfirmed"])
-    views = mean_of_four(left), mean_of_four(seen)
     near, around, wide = (tuple(cv2.blur(view, (size, size)) for view in views)
                           for size in (BLOCK_CELLS, GLINT_CELLS, GLOSS_CELLS))
     np.multiply(near[0], np.float32(1 / 100), out=put["bright"])
@@ -156,6 +154,28 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
     for name, pair in (("glint", around), ("glint_near", near)):
         np.abs(cv2.Sobel(_brighter(*pair), cv2.CV_32F, 1, 0, ksize=1, scale=0.5), out=put[name])
     return cells
+
+
+@compiled
+def _means(left: Image, seen: Image, known: Known) -> tuple[Cells, Cells, Cells, Cells]:
+    """Of each cell: the left image's squared slope along the row, the share without a match, both images in whole levels."""
+    rows, cols = left.shape[0] // 2, left.shape[1] // 2
+    steep, missing = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    here, there = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    squares = np.zeros(left.shape[1], np.int32)
+    for row in range(rows):
+        v, below = 2 * row, 2 * row + 1
+        for u in range(1, len(squares) - 1):
+            rise, rise_below = np.int32(left[v, u + 1]) - left[v, u - 1], np.int32(left[below, u + 1]) - left[below, u - 1]
+            squares[u] = rise * rise + rise_below * rise_below
+        for col in range(cols):
+            u, beside = 2 * col, 2 * col + 1
+            steep[row, col] = np.float32(squares[u] + squares[beside]) * np.float32(1 / 16)
+            matched = np.int32(known[v, u]) + known[v, beside] + known[below, u] + known[below, beside]
+            missing[row, col] = 1 - np.float32(matched) * np.float32(0.25)
+            here[row, col] = (np.int32(left[v, u]) + left[v, beside] + left[below, u] + left[below, beside] + 2) // 4
+            there[row, col] = (np.int32(seen[v, u]) + seen[v, beside] + seen[below, u] + seen[below, beside] + 2) // 4
+    return steep, missing, here, there
 
 
 def _brighter(left: Cells, right: Cells) -> Cells:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -42,10 +41,9 @@ def planes(disparity: Cells, weight: Cells, radius: int, middle: float) -> Plane
     centred = disparity - np.float32(middle)
     weighted = weight * centred
     beyond = length - 1 - radius
-    # rows of zeros around, so that windows end nowhere
-    fields = (np.asarray(cv2.copyMakeBorder(field, radius, beyond, radius, beyond, cv2.BORDER_CONSTANT), np.float32)
-              for field in (weight, weighted, weighted * centred))
-    return Planes(*_planes(*fields, taps, radius))
+    padded, inside = np.zeros((3, *(side + length - 1 for side in weight.shape)), np.float32), slice(radius, -beyond)
+    padded[:, inside, inside] = weight, weighted, weighted * centred     # zeros around: windows end nowhere
+    return Planes(*_planes(padded[0], padded[1], padded[2], taps, radius))
 
 
 @compiled

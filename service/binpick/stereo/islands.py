@@ -78,7 +78,7 @@ def _first(joined: Runs, number: np.int32) -> np.int32:
 @compiled
 def _sizes(begin: Runs, joined: Runs) -> Runs:
     """Pixels of each run's island. Runs are joined to earlier ones only."""
-    size = begin[1:] - begin[:-1]
+    size: Runs = begin[1:] - begin[:-1]
     for number in range(len(size) - 1, -1, -1):
         if joined[number] != number:
             size[joined[number]] += size[number]

@@ -36,8 +36,8 @@ from binpick.stereo.lanes import (
 from binpick.stereo.strip import Strip, strips
 
 STRIP_ROWS, WARM_ROWS = 608, 26
-"""Most rows that are matched at a time, half of a camera's, and rows above them from which the way down begins: so deep what is above is felt. They do
-not depend on the machine: the bytes are the same whoever computes a strip."""
+"""Most rows that are matched at a time, half of a camera's, and rows above them from which the way down begins: so deep what is
+above is felt. They do not depend on the machine: the bytes are the same whoever computes a strip."""
 NONE = np.int16(-16)
 """Nothing found: OpenCV's mark, one px below the range."""
 TOP = np.int16(32767)
