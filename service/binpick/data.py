@@ -1,5 +1,6 @@
 """The frozen values that flow from stage to stage; arrays carry shape and dtype, NaN means not measured."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -155,15 +156,20 @@ class Rectified:
 class Depth:
     """Disparity of the window's pixels in px, absolute. `measured` gates it: elsewhere `disparity` is NaN.
 
-    `filled` is the smoothed map for people; never a grasp's evidence. `sigma_px` is each measured pixel's 1-sigma noise,
-    NaN elsewhere.
+    `fill` makes the smoothed map for people, which is never a grasp's evidence: no cycle waits for it. `sigma_px` is each
+    measured pixel's 1-sigma noise, NaN elsewhere.
     """
 
     disparity: Disparity
-    filled: Disparity
+    fill: Callable[[], Disparity]
     confidence: UInt8[np.ndarray, "h w"]
     measured: Mask
     sigma_px: Disparity
+
+    @property
+    def filled(self) -> Disparity:
+        """The map for people, px, absolute everywhere; made anew each time."""
+        return frozen(self.fill())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

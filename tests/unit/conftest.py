@@ -104,7 +104,7 @@ def plant(rig: Rig, job: settings.Job) -> Callable[..., Planted]:
         blank = np.zeros((view.height, view.width + view.num_disparities), dtype=np.uint8)
         rectified = Rectified(left=blank, right=blank, window=view, margin=view.num_disparities, focal_px=rect.focal_px,
                               baseline_m=rect.baseline_m, cx_px=rect.cx_px, cy_px=rect.cy_px, T_camera_rect=rect.T_camera_rect)
-        values = Depth(disparity=disparity, filled=np.nan_to_num(disparity), measured=measured,
+        values = Depth(disparity=disparity, fill=lambda: np.nan_to_num(disparity), measured=measured,
                        confidence=np.full(depth.shape, 255, dtype=np.uint8),
                        sigma_px=np.where(measured, np.float32(max(noise_px, 0.05)), np.float32(np.nan)))
         return Planted(rig, job, values, rectified, T_camera_bin)

@@ -71,7 +71,7 @@ def cycle(code: Code = Code.OK, *grasps: GraspMessage) -> CycleResult:
                     grasps=grasps)
     return CycleResult(
         result, Rectified(padded, padded, window, MARGIN, FOCAL, 0.15, 220.0, 160.0, T_CAMERA_RECT),
-        Depth(disparity, np.nan_to_num(disparity), (measured * 255).astype(np.uint8), measured,
+        Depth(disparity, lambda: np.nan_to_num(disparity), (measured * 255).astype(np.uint8), measured,
               np.where(measured, np.float32(0.2), np.float32(np.nan))),
         lambda: OrganisedCloud(xyz, np.zeros(shape, np.float32), window), segments)
 

@@ -63,7 +63,7 @@ def test_images_are_shrunk_by_two_exactly(shape: tuple[int, int], num_disparitie
 
 def depth(disparity: np.ndarray) -> Depth:
     field = disparity.astype(np.float32)
-    return Depth(disparity=field, filled=np.nan_to_num(field), confidence=np.full(field.shape, 255, np.uint8),
+    return Depth(disparity=field, fill=lambda: np.nan_to_num(field), confidence=np.full(field.shape, 255, np.uint8),
                  measured=np.isfinite(field), sigma_px=np.where(np.isfinite(field), np.float32(0.1), np.float32(np.nan)))
 
 

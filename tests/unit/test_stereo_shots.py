@@ -131,7 +131,7 @@ def test_agreement_weighs_by_certainty() -> None:
 def test_fused_depth_is_measured_where_the_patterns_agree() -> None:
     def depth(value: float, confidence: int) -> Depth:
         disparity = np.full((2, 2), value, np.float32)
-        return Depth(disparity=disparity, filled=disparity, confidence=np.full((2, 2), confidence, np.uint8),
+        return Depth(disparity=disparity, fill=lambda: disparity, confidence=np.full((2, 2), confidence, np.uint8),
                      measured=np.ones((2, 2), bool), sigma_px=np.full((2, 2), 0.1, np.float32))
 
     one = depth(20.0, 255)

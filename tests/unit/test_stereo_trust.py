@@ -7,9 +7,9 @@ import hypothesis.extra.numpy as arrays
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 
-from binpick.stereo import trust
+from binpick.stereo import islands, trust
 from binpick.stereo.evidence import OF_CELLS, OF_PIXELS, Evidence
 from binpick.stereo.strip import joined, strips
 from binpick.stereo.trust import Trust
@@ -34,6 +34,7 @@ def test_more_risk_never_measures_less(disparity: np.ndarray, odds: np.ndarray, 
     assert np.array_equal(trust.believed(disparity, judged(odds), 1.0), np.isfinite(disparity))
 
 
+@settings(deadline=None)
 @given(FOUND, ODDS, RISK, st.integers(0, 20))
 def test_only_what_is_believed_is_a_speckle(disparity: np.ndarray, odds: np.ndarray, risk: float, size: int) -> None:
     sound = trust.believed(disparity, judged(odds), risk)
@@ -133,6 +134,14 @@ def test_what_was_fitted_knows_every_measure_and_the_signs_of_the_law_make_sense
     # images that differ, planes that depart or do not fit, and holes around never speak for a match
     assert min(wrong[name] for name in ("departure", "mismatch", "misfit", "holes")) > 0
     assert wrong["rival"] == 0, "where one surface is seen, it has no rival"
+
+
+@settings(deadline=None)
+@given(arrays.arrays(np.float32, SHAPE, elements=st.floats(0, 7, width=32)), arrays.arrays(np.bool_, SHAPE), st.integers(1, 20))
+def test_islands_are_those_of_opencv(disparity: np.ndarray, sound: np.ndarray, most_px: int) -> None:
+    fixed = np.where(sound, disparity * 16, -1000).astype(np.int16)
+    cv2.filterSpeckles(fixed, -1000, most_px, 32)
+    assert np.array_equal(islands.small(disparity, sound, most_px), sound & (fixed == -1000))
 
 
 @pytest.mark.parametrize("seed", range(5))

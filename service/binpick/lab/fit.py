@@ -135,7 +135,7 @@ def _scene(pair: Rectified, settings: StereoSettings, reach: refine.Reach, targe
     """`target` is the truth on the pair's pixels, in full-resolution px; errors are the pair's own px."""
     matcher = settings.matcher.shrunk if isinstance(settings.matcher, Hybrid) else settings.matcher
     whole = search.search(pair.left, pair.right, pair.window.num_disparities, matcher)
-    confidence, _ = filter.confirm(whole, pair, matcher, settings)
+    confidence, _ = filter.confirm(whole, pair, matcher)
     found = np.ascontiguousarray(whole[:, pair.margin:])
     refined = refine.refine(found, pair, reach)
     seen = evidence.gather(found, refined, confidence, pair)

@@ -17,9 +17,9 @@ from binpick.stereo.strip import Strip, joined, strips
 from binpick.stereo.warp import warp
 from binpick.stereo.weights import Model
 
-STRIP_ROWS, OVERLAP_ROWS = 248, 24
-"""Rows that are refined and judged at a time, and what they see beyond: planes reach 18 rows, their bend 26 (at a border
-it sees two less). Both are even, as cells of 2x2 px demand, and do not depend on the machine: a strip's result is the same
+STRIP_ROWS, OVERLAP_ROWS = 608, 24
+"""Most rows that are refined and judged at a time, half of a camera's, and what they see beyond: planes reach 18 rows, their
+bend 26 (at a border it sees two less). Strips begin at even rows, as cells of 2x2 px demand. A strip's result is the same
 whoever computes it."""
 TEXTURE_PX = 7
 WARM_PX = 96
@@ -62,19 +62,19 @@ def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettin
     cut = strips(found.shape[0], STRIP_ROWS, OVERLAP_ROWS)
     with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-strip") as pool:
         # planes need no confidence: they are fitted beside the right view's search
-        confirming = pool.submit(filter.confirm, whole, seen, matcher, settings, guide)
+        confirming = pool.submit(filter.confirm, whole, seen, matcher)
         refined = list(pool.map(lambda rows: refine.refine(found[rows.seen], rows.of(rectified), scale.reach), cut))
-        confidence, filled = confirming.result()
+        confidence, views = confirming.result()
         judge = partial(_judged, found, confidence, rectified, scale.model, settings.max_risk)
         disparity, sound, sigma_px = joined(pool.map(judge, cut, refined))
         clean = partial(_cleaned, disparity, sound, settings.speckle_px)
-        measured, = joined(pool.map(clean, strips(found.shape[0], 2 * STRIP_ROWS, settings.speckle_px)))
+        measured, = joined(pool.map(clean, strips(found.shape[0], STRIP_ROWS, settings.speckle_px)))
     low, nan = np.float32(rectified.window.min_disparity), np.float32(np.nan)
     disparity += low
     for field in (disparity, sigma_px):
         np.copyto(field, nan, where=~measured)
-    return Depth(disparity=frozen(disparity), filled=frozen(filled + low), confidence=frozen(confidence),
-                 measured=frozen(measured), sigma_px=frozen(sigma_px))
+    return Depth(disparity=frozen(disparity), fill=partial(filter.fill, views, seen, settings, guide),
+                 confidence=frozen(confidence), measured=frozen(measured), sigma_px=frozen(sigma_px))
 
 
 def _judged(found: Disparity, confidence: UInt8[np.ndarray, "h w"], rectified: Rectified, model: Model, max_risk: float,

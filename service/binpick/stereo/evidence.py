@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.compiled import compiled
-from binpick.stereo.refine import Cells, Refined, mean_of_four
+from binpick.stereo.refine import Cells, Refined
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
@@ -109,28 +109,31 @@ def _compared(left: Image, right: UInt8[np.ndarray, "h whole_w"], margin: int, f
     much more so at `high` than at `low`."""
     seen, mismatch, difference = np.empty_like(left), np.empty_like(flat), np.empty_like(flat)
     line, there = np.empty(right.shape[1] + 1, np.float32), np.empty(left.shape[1], np.float32)
-    other = np.empty_like(there)
+    grey, scale, other = np.empty_like(there), np.empty_like(there), np.empty_like(there)
     for v in range(left.shape[0]):
         lengthened(right[v], line)
+        for u in range(len(grey)):
+            grey[u], scale[u] = left[v, u], per_sigma[left[v, u]]
         sample(line, high[v], margin, there)
-        _unlike(left[v], there, per_sigma, difference[v])
+        _unlike(grey, scale, there, difference[v])
         sample(line, low[v], margin, there)
-        _unlike(left[v], there, per_sigma, other)
+        _unlike(grey, scale, there, other)
         for u in range(len(other)):
             difference[v, u] -= other[u]
         sample(line, flat[v], margin, there)
-        _unlike(left[v], there, per_sigma, mismatch[v])
+        _unlike(grey, scale, there, mismatch[v])
         for u in range(len(there)):
             seen[v, u] = np.uint8(there[u])
     return seen, mismatch, difference
 
 
 @compiled
-def _unlike(left: UInt8[np.ndarray, "w"], there: Line, per_sigma: Float32[np.ndarray, "256"], unlike: Line) -> None:
-    """Of a row, and `there` rounded to whole grey levels."""
-    for u in range(len(left)):
+def _unlike(grey: Line, scale: Line, there: Line, unlike: Line) -> None:
+    """Of a row in units of `scale`, and `there` rounded to whole grey levels."""
+    for u in range(len(grey)):
         there[u] = np.floor(there[u] + HALF)
-        unlike[u] = min(abs(np.float32(left[u]) - there[u]) * per_sigma[left[u]], np.float32(MOST))
+        off = abs(grey[u] - there[u]) * scale[u]
+        unlike[u] = off if off < np.float32(MOST) else np.float32(MOST)
 
 
 def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined: Refined,
@@ -140,12 +143,10 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
     put = dict(zip(OF_CELLS, cells, strict=True))
     put["misfit"][:], put["slope"][:], put["bend"][:] = refined.misfit, refined.slope, refined.bend
     put["support"][:] = refined.support
-    slope = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=1, scale=0.5)
-    np.log(1 + cv2.blur(mean_of_four(slope * slope), (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
-    missing = 1 - mean_of_four(known.astype(np.float32))
+    steep, missing, *views = _means(left, seen, known)
+    np.log(1 + cv2.blur(steep, (BLOCK_CELLS, BLOCK_CELLS)), out=put["texture"])
     cv2.blur(missing, (WIDE_CELLS, WIDE_CELLS), dst=put["holes"])
     np.multiply(255 - confidence[:2 * rows:2, :2 * cols:2], np.float32(1 / 255), out=put["unconfirmed"])
-    views = mean_of_four(left), mean_of_four(seen)
     near, around, wide = (tuple(cv2.blur(view, (size, size)) for view in views)
                           for size in (BLOCK_CELLS, GLINT_CELLS, GLOSS_CELLS))
     np.multiply(near[0], np.float32(1 / 100), out=put["bright"])
@@ -153,6 +154,28 @@ def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined:
     for name, pair in (("glint", around), ("glint_near", near)):
         np.abs(cv2.Sobel(_brighter(*pair), cv2.CV_32F, 1, 0, ksize=1, scale=0.5), out=put[name])
     return cells
+
+
+@compiled
+def _means(left: Image, seen: Image, known: Known) -> tuple[Cells, Cells, Cells, Cells]:
+    """Of each cell: the left image's squared slope along the row, the share without a match, both images in whole levels."""
+    rows, cols = left.shape[0] // 2, left.shape[1] // 2
+    steep, missing = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    here, there = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    squares = np.zeros(left.shape[1], np.int32)
+    for row in range(rows):
+        v, below = 2 * row, 2 * row + 1
+        for u in range(1, len(squares) - 1):
+            rise, rise_below = np.int32(left[v, u + 1]) - left[v, u - 1], np.int32(left[below, u + 1]) - left[below, u - 1]
+            squares[u] = rise * rise + rise_below * rise_below
+        for col in range(cols):
+            u, beside = 2 * col, 2 * col + 1
+            steep[row, col] = np.float32(squares[u] + squares[beside]) * np.float32(1 / 16)
+            matched = np.int32(known[v, u]) + known[v, beside] + known[below, u] + known[below, beside]
+            missing[row, col] = 1 - np.float32(matched) * np.float32(0.25)
+            here[row, col] = (np.int32(left[v, u]) + left[v, beside] + left[below, u] + left[below, beside] + 2) // 4
+            there[row, col] = (np.int32(seen[v, u]) + seen[v, beside] + seen[below, u] + seen[below, beside] + 2) // 4
+    return steep, missing, here, there
 
 
 def _brighter(left: Cells, right: Cells) -> Cells:

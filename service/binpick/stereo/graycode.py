@@ -1,6 +1,7 @@
 """Gray code of a programmable projector: each camera reads the projector's columns, equal columns are matches."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -76,7 +77,7 @@ def measure(shots: tuple[Rectified, ...], lights: tuple[Light, ...], speckle_px:
     measured = raw >= 0
     nan = np.float32(np.nan)
     disparity, sigma_px = np.where(measured, disparity, nan), np.where(measured, sigma_px, nan)
-    return Depth(disparity=frozen(disparity), filled=frozen(_filled(disparity, measured)),
+    return Depth(disparity=frozen(disparity), fill=partial(_filled, disparity, measured),
                  confidence=frozen(measured.astype(np.uint8) * 255), measured=frozen(measured), sigma_px=frozen(sigma_px))
 
 

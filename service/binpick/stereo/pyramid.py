@@ -1,6 +1,7 @@
 """Half resolution: a rectified pair shrunk by two, and what was found there brought back."""
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -51,11 +52,14 @@ def double(depth: Depth, window: Window) -> Depth:
     disparity = _fine(depth.disparity, shape)
     disparity *= 2
     disparity += low
-    filled = _large(2 * depth.filled + low, shape, cv2.INTER_LINEAR)
     confidence = np.asarray(_large(depth.confidence, shape, cv2.INTER_LINEAR), np.uint8)
-    return Depth(disparity=frozen(disparity), filled=frozen(filled), confidence=frozen(confidence),
+    return Depth(disparity=frozen(disparity), fill=partial(_filled, depth, shape, low), confidence=frozen(confidence),
                  measured=frozen(np.isfinite(disparity)),
                  sigma_px=frozen(_large(2 * depth.sigma_px, shape, cv2.INTER_NEAREST)))
+
+
+def _filled(depth: Depth, shape: tuple[int, int], low: np.float32) -> Disparity:
+    return _large(2 * depth.filled + low, shape, cv2.INTER_LINEAR)
 
 
 def _half(num_disparities: int) -> int:

@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from binpick.data import Disparity, Image, Rectified
+from binpick.stereo import fit, sums
 from binpick.stereo.compiled import compiled
+from binpick.stereo.fit import Planes
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
@@ -29,10 +31,6 @@ LEAST_WEIGHT = np.float32(0.02)
 """What a cell without any slope still weighs: it says what the matcher said."""
 ASIDE = 2.0
 """How many times better a window aside must fit to have the same say as the one around the pixel."""
-LEAST_COST = 1e-5
-"""Squared px: no plane fits better than this, and no window outvotes all others by more."""
-SLOPE_PRIOR = 0.05
-"""Cells² added to the windows' moments: keeps planes with little support level."""
 TRUSTED_PX = 0.6
 """A plane that contradicts the match by more is not believed: the match then stands as it was found."""
 
@@ -73,7 +71,7 @@ def refine(matched: Disparity, rectified: Rectified, reach: Reach) -> Refined:
     """The matched disparity (px relative to the window's smallest, NaN: none), on the window's pixels, refined."""
     cells = _cells(matched, rectified, reach.band_px)
     middle = rectified.window.num_disparities / 2
-    planes = _fits(cells, reach.radius, middle)
+    planes = fit.planes(cells.disparity, cells.weight, reach.radius, middle)
     vote = _vote(planes, reach.radius, middle)
     disparity, departure = _believed(matched, cells.weight, vote.level, vote.slope_u, vote.slope_v)
     # not cv2.magnitude: its last bit depends on where in memory the arrays lie
@@ -185,44 +183,6 @@ def _band(image: Image, band_px: int) -> Field:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Planes:
-    """Least-squares planes of the windows centred on every cell: level at the centre, slopes per cell, mean squared misfit."""
-
-    level: Cells
-    slope_u: Cells
-    slope_v: Cells
-    misfit: Cells
-    support: Cells
-
-
-def _fits(cells: _Corrected, radius: int, middle: float) -> _Planes:
-    """The planes. float32 suffices around the middle: |d| < 64 px, misfits good to 1e-3 px²."""
-    w = cells.weight
-    d = (cells.disparity - np.float32(middle)) * (w > 0)
-    ones = np.ones(2 * radius + 1, dtype=np.float32)
-    ramp = np.arange(-radius, radius + 1, dtype=np.float32)
-
-    def window(field: Cells, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Cells:
-        summed: Cells = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
-        return summed
-
-    wd = w * d
-    n = np.maximum(window(w, ones, ones), np.float32(1e-6))
-    scale = 1 / n
-    mean_u, mean_v, mean_d = window(w, ramp, ones) * scale, window(w, ones, ramp) * scale, window(wd, ones, ones) * scale
-    uu = window(w, ramp**2, ones) * scale - mean_u**2 + np.float32(SLOPE_PRIOR)
-    vv = window(w, ones, ramp**2) * scale - mean_v**2 + np.float32(SLOPE_PRIOR)
-    uv = window(w, ramp, ramp) * scale - mean_u * mean_v
-    ud = window(wd, ramp, ones) * scale - mean_u * mean_d
-    vd = window(wd, ones, ramp) * scale - mean_v * mean_d
-    dd = window(wd * d, ones, ones) * scale - mean_d**2
-    det = uu * vv - uv * uv
-    a, b = (ud * vv - vd * uv) / det, (vd * uu - ud * uv) / det
-    level = mean_d - a * mean_u - b * mean_v + np.float32(middle)
-    return _Planes(level, a, b, np.maximum(dd - a * ud - b * vd, np.float32(0)), n * np.float32(1 / ones.size**2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
     """The weighted mean of the planes of a cell's windows, continued to the cell; `misfit` is the logarithm of theirs, px²."""
 
@@ -232,31 +192,40 @@ class _Vote:
     misfit: Cells
 
 
-def _vote(planes: _Planes, radius: int, middle: float) -> _Vote:
+def _vote(planes: Planes, radius: int, middle: float) -> _Vote:
     """Nine windows: around the cell and `radius` to all sides. Each one's say is the inverse cube of its cost.
 
-    With the square edges blur, with the fourth power noise is taken out no better. The sums are separable.
+    With the square edges blur, with the fourth power noise is taken out no better.
     """
-    cost = np.maximum(planes.misfit + np.float32(1e-3) / (planes.support + np.float32(1e-3)), np.float32(LEAST_COST))
-    say = 1 / (cost * cost * cost)
-    weighted_u, weighted_v = say * planes.slope_u, say * planes.slope_v
-    everywhere, turned = np.zeros((2, 2 * radius + 1), np.float32)
-    everywhere[::radius], turned[::radius] = 1, (-radius, 0, radius)
+    say, level, slope_u, slope_v = _counted(planes.say, planes.level, planes.slope_u, planes.slope_v, radius)
+    return _Vote(level + np.float32(middle), slope_u, slope_v, np.log(say) * np.float32(-1 / 3))
 
-    def around(field: Cells, along_u: Float32[np.ndarray, "k"], along_v: Float32[np.ndarray, "k"]) -> Cells:
-        summed: Cells = cv2.sepFilter2D(field, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
-        return summed
 
-    def all_of(field: Cells) -> Cells:
-        summed: Cells = np.asarray(around(field, everywhere, everywhere) + field * np.float32(ASIDE**3 - 1), np.float32)
-        return summed
-
-    total = all_of(say)
-    level = all_of(say * (planes.level - np.float32(middle)))
-    level -= around(weighted_u, turned, everywhere) + around(weighted_v, everywhere, turned)
-    scale = 1 / total
-    return _Vote(level * scale + np.float32(middle), all_of(weighted_u) * scale, all_of(weighted_v) * scale,
-                 np.log(total) * np.float32(-1 / 3))
+@compiled
+def _counted(say: Cells, level: Cells, slope_u: Cells, slope_v: Cells, radius: int) -> tuple[Cells, Cells, Cells, Cells]:
+    """The windows' whole say, and what they say of a cell, of planes weighted by their say with `radius` zeros around."""
+    rows, cols = say.shape[0] - 2 * radius, say.shape[1] - 2 * radius
+    says, levels = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    slopes_u, slopes_v = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    everywhere, turned = np.array((1, 1, 1, 0), np.float32), np.array((-radius, 0, radius, 0), np.float32)
+    column = np.empty((5, say.shape[1]), np.float32)
+    far, own = 2 * radius, np.float32(ASIDE**3 - 1)
+    for v in range(rows):
+        column[:] = 0
+        for k, (field, taps) in enumerate(((say, everywhere), (level, everywhere), (slope_u, everywhere), (slope_v, everywhere),
+                                           (slope_v, turned))):
+            sums.add_four(column[k], field[v], field[v + radius], field[v + far], field[v], taps)
+        for u in range(cols):
+            at = u + radius
+            total = column[0, u] + column[0, at] + column[0, u + far] + say[v + radius, at] * own
+            plane = column[1, u] + column[1, at] + column[1, u + far] + level[v + radius, at] * own
+            plane -= (column[2, u + far] - column[2, u]) * np.float32(radius)
+            plane -= column[4, u] + column[4, at] + column[4, u + far]
+            scale = 1 / total
+            says[v, u], levels[v, u] = total, plane * scale
+            slopes_u[v, u] = (column[2, u] + column[2, at] + column[2, u + far] + slope_u[v + radius, at] * own) * scale
+            slopes_v[v, u] = (column[3, u] + column[3, at] + column[3, u + far] + slope_v[v + radius, at] * own) * scale
+    return says, levels, slopes_u, slopes_v
 
 
 def spread(cells: Cells, shape: tuple[int, int]) -> Field:

@@ -33,10 +33,11 @@ from binpick.stereo.lanes import (
     where_less,
     where_within,
 )
+from binpick.stereo.strip import Strip, strips
 
-STRIP_ROWS, WARM_ROWS = 248, 26
-"""Rows that are matched at a time, and rows above them from which the way down begins: so deep what is above is felt. They do
-not depend on the machine: the bytes are the same whoever computes a strip."""
+STRIP_ROWS, WARM_ROWS = 608, 26
+"""Most rows that are matched at a time, half of a camera's, and rows above them from which the way down begins: so deep what is
+above is felt. They do not depend on the machine: the bytes are the same whoever computes a strip."""
 NONE = np.int16(-16)
 """Nothing found: OpenCV's mark, one px below the range."""
 TOP = np.int16(32767)
@@ -76,11 +77,11 @@ def _match(image: Image, other: UInt8[np.ndarray, "h other_w"], disparities: int
     with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-match") as pool:
         here, there = pool.map(costs.prepared, (image, other))
 
-        def strip(top: int) -> None:
-            _strip(here, there, top, min(top + STRIP_ROWS, rows), disparities, matcher.block_px // 2, np.int16(matcher.p1),
+        def match(strip: Strip) -> None:
+            _strip(here, there, strip.top, strip.bottom, disparities, matcher.block_px // 2, np.int16(matcher.p1),
                    np.int16(matcher.p2), unique_percent, checked, found)
 
-        list(pool.map(strip, range(0, rows, STRIP_ROWS)))
+        list(pool.map(match, strips(rows, STRIP_ROWS, 0)))
     return np.asarray(cv2.medianBlur(found, 3), np.int16)
 
 

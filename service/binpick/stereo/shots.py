@@ -1,6 +1,7 @@
 """Several shots of one scene become what is matched: exposures merged, glare taken out, patterns side by side."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -141,10 +142,13 @@ def fuse(depths: tuple[Depth, ...]) -> Depth:
     if len(depths) == 1:
         return depths[0]
     disparity, sigma_px = agree(tuple(depth.disparity for depth in depths), tuple(depth.sigma_px for depth in depths))
-    filled = np.asarray(np.mean([depth.filled for depth in depths], axis=0, dtype=np.float32))
     confidence = np.minimum.reduce([depth.confidence for depth in depths])
-    return Depth(disparity=disparity, filled=frozen(filled), confidence=frozen(confidence),
+    return Depth(disparity=disparity, fill=partial(_filled, depths), confidence=frozen(confidence),
                  measured=frozen(np.isfinite(disparity)), sigma_px=sigma_px)
+
+
+def _filled(depths: tuple[Depth, ...]) -> Disparity:
+    return np.asarray(np.mean([depth.filled for depth in depths], axis=0, dtype=np.float32))
 
 
 def agree(disparities: tuple[Disparity, ...], sigmas: tuple[Disparity, ...]) -> tuple[Disparity, Disparity]:

@@ -31,8 +31,13 @@ class Strip:
         return field[self.top - self.first:self.bottom - self.first]
 
 
-def strips(rows: int, each: int, overlap: int) -> list[Strip]:
-    """`each` rows at a time, the last one fewer, seen with `overlap` more to both sides where there are any."""
+def strips(rows: int, most: int, overlap: int) -> list[Strip]:
+    """At most so many rows at a time, seen with `overlap` more to both sides where there are any.
+
+    Strips are an even number of equal ones, so that two threads have as much to do; they do not depend on the machine.
+    """
+    count = 2 * -(-rows // (2 * most))
+    each = max(-(-rows // (2 * count)) * 2, 2)
     return [Strip(max(0, top - overlap), top, min(top + each, rows), min(top + each + overlap, rows))
             for top in range(0, rows, each)]
 

@@ -8,12 +8,14 @@ exam's tuning seeds by `lab/fit.py`; `binpick bench stereo` says how well they h
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Int
 
 from binpick.data import Disparity, Mask
+from binpick.stereo import islands, sums
 from binpick.stereo.compiled import compiled
 from binpick.stereo.evidence import Evidence
 from binpick.stereo.weights import Model, Network
@@ -21,13 +23,15 @@ from binpick.stereo.weights import Model, Network
 LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.02, 3.0
 """Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what it was fitted on."""
 BLOCK = 1024
-"""Columns that are taken through a network at a time: they stay in the cache, and so few BLAS never shares among threads."""
+"""Columns that are taken through a network at a time: they stay in the cache."""
 QUARTER = np.float32(0.25)
 Pixels = Float32[np.ndarray, "n h w"]
 OfCells = Float32[np.ndarray, "m h2 w2"]
 Measures = Float32[np.ndarray, "n k"]
 Field = Float32[np.ndarray, "h w"]
 Vector = Float32[np.ndarray, "n"]
+Weights: TypeAlias = tuple[np.float32, Vector, Vector, Float32[np.ndarray, "units k"]]
+"""A network's constant, out, offsets, hidden."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,98 +44,110 @@ class Trust:
 
 def judge(evidence: Evidence, model: Model) -> Trust:
     """What the evidence says of every pixel, by what was fitted at its resolution."""
-    pixels, cells, two, law = evidence.pixels, evidence.cells, evidence.two, model.wrong
-    of_cells = answer(model.sigma, _means(pixels, cells)).reshape(cells.shape[1:])
-    weights = np.float32(law.constant), np.array(law.pixels, np.float32), np.array(law.cells, np.float32)
-    odds, log_sigma = _alone(pixels, cells, *weights, of_cells)
-    contested = _contested(pixels, cells, two, int(np.count_nonzero(two)))
-    _put(odds, two, answer(model.wrong_between, contested))
-    _put(log_sigma, two, answer(model.sigma_between, contested))
+    law = np.float32(model.wrong.constant), np.array(model.wrong.pixels, np.float32), np.array(model.wrong.cells, np.float32)
+    networks = (_weights(network) for network in (model.sigma, model.wrong_between, model.sigma_between))
+    odds, log_sigma = _judged(evidence.pixels, evidence.cells, evidence.two, law, *networks)
     return Trust(odds, np.clip(cv2.exp(log_sigma), LEAST_SIGMA_PX, MOST_SIGMA_PX))
 
 
 def answer(network: Network, measures: Measures) -> Float32[np.ndarray, "k"]:
     """The network's figure for every column of measures."""
-    hidden, offsets, out = (np.array(weights, np.float32) for weights in (network.hidden, network.offsets, network.out))
-    figures = np.empty(measures.shape[1], np.float32)
+    weights, figures = _weights(network), np.empty(measures.shape[1], np.float32)
     for begin in range(0, len(figures), BLOCK):
-        block = slice(begin, begin + BLOCK)
-        active = hidden @ measures[:, block]
-        active += offsets[:, None]
-        np.matmul(out, np.maximum(active, 0, out=active), out=figures[block])
-    figures += np.float32(network.constant)
+        _answer(weights, np.ascontiguousarray(measures[:, begin:begin + BLOCK]), figures[begin:begin + BLOCK])
     return figures
 
 
-@compiled
-def _means(pixels: Pixels, cells: OfCells) -> Measures:
-    """All measures of every cell: the pixels' means, then its own."""
-    n, m, rows, cols = len(pixels), *cells.shape
-    measures = np.empty((n + m, rows, cols), np.float32)
-    for k in range(n):
-        for row in range(rows):
-            top, bottom = pixels[k, 2 * row], pixels[k, 2 * row + 1]
-            for col in range(cols):
-                measures[k, row, col] = (top[2 * col] + top[2 * col + 1] + bottom[2 * col] + bottom[2 * col + 1]) * QUARTER
-    measures[n:] = cells
-    return measures.reshape((n + m, rows * cols))
+def _weights(network: Network) -> Weights:
+    hidden, offsets, out = (np.array(weights, np.float32) for weights in (network.hidden, network.offsets, network.out))
+    return np.float32(network.constant), out, offsets, hidden
 
 
 @compiled
-def _alone(pixels: Pixels, cells: OfCells, constant: np.float32, of_pixels: Vector, of_cells: Vector, log_sigma: Field,
-           ) -> tuple[Field, Field]:
-    """Log-odds and the log of sigma where one surface is seen; the last cells also on an odd last row and column."""
+def _answer(network: Weights, measures: Measures, figures: Vector) -> None:
+    """Figures of the first columns: as many as there is room for."""
+    constant, out, offsets, hidden = network
+    active = np.empty_like(figures)
+    figures[:] = constant
+    for unit in range(len(out)):
+        active[:] = offsets[unit]
+        for k in range(0, len(measures) - 3, 4):
+            sums.add_four(active, measures[k], measures[k + 1], measures[k + 2], measures[k + 3], hidden[unit, k:k + 4])
+        for k in range(len(measures) // 4 * 4, len(measures)):
+            sums.add(active, measures[k], hidden[unit, k])
+        for i in range(len(active)):
+            figures[i] += out[unit] * active[i] if active[i] > 0 else np.float32(0)
+
+
+@compiled
+def _judged(pixels: Pixels, cells: OfCells, two: Mask, law: tuple[np.float32, Vector, Vector], sigma: Weights,
+            wrong_between: Weights, sigma_between: Weights) -> tuple[Field, Field]:
+    """Log-odds and the log of sigma, row by row of cells; the last ones also on an odd last row and column."""
     (m, rows, cols), (n, height, width) = cells.shape, pixels.shape
     odds, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    line = np.empty(cols, np.float32)
-    for v in range(height):
-        row = min(v // 2, rows - 1)
-        line[:] = constant
+    line, line_sigma = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    measures, figures, places = np.empty((n + m, width), np.float32), np.empty(width, np.float32), np.empty(width, np.intp)
+    for row in range(rows):
+        _means(pixels, cells, row, measures)
+        _answer(sigma, measures, line_sigma)
+        line[:] = law[0]
         for k in range(m):
-            _add(line, cells[k, row], of_cells[k])
-        for u in range(2 * cols):
-            odds[v, u], sigmas[v, u] = line[u // 2], log_sigma[row, u // 2]
-        if width % 2:
-            odds[v, width - 1], sigmas[v, width - 1] = line[cols - 1], log_sigma[row, cols - 1]
-        for k in range(n):
-            _add(odds[v], pixels[k, v], of_pixels[k])
+            sums.add(line, cells[k, row], law[2][k])
+        for v in range(2 * row, 2 * row + 2 if row < rows - 1 else height):
+            _twice(line, odds[v])
+            _twice(line_sigma, sigmas[v])
+            for k in range(n):
+                sums.add(odds[v], pixels[k, v], law[1][k])
+            between = places[:_places(two[v], places)]
+            _contested(pixels, cells, v, between, measures)
+            for network, field in ((wrong_between, odds), (sigma_between, sigmas)):
+                _answer(network, measures, figures[:len(between)])
+                for i in range(len(between)):
+                    field[v, between[i]] = figures[i]
     return odds, sigmas
 
 
 @compiled
-def _add(total: Vector, values: Vector, weight: np.float32) -> None:
-    if weight != 0:
-        for i in range(len(total)):
-            total[i] += values[i] * weight
+def _means(pixels: Pixels, cells: OfCells, row: int, measures: Measures) -> None:
+    """All measures of a row of cells: the pixels' means, then its own."""
+    n = len(pixels)
+    for k in range(n):
+        top, bottom = pixels[k, 2 * row], pixels[k, 2 * row + 1]
+        for col in range(cells.shape[2]):
+            measures[k, col] = (top[2 * col] + top[2 * col + 1] + bottom[2 * col] + bottom[2 * col + 1]) * QUARTER
+    for k in range(len(cells)):
+        measures[n + k, :cells.shape[2]] = cells[k, row]
 
 
 @compiled
-def _contested(pixels: Pixels, cells: OfCells, two: Mask, count: int) -> Measures:
-    """All measures of the `count` pixels between two surfaces, in the order of rows."""
-    (m, rows, cols), n, begin = cells.shape, len(pixels), 0
-    measures, places = np.empty((n + m, count), np.float32), np.empty(two.shape[1], np.intp)
-    for v in range(len(two)):
-        found, row = 0, min(v // 2, rows - 1)
-        for u in range(two.shape[1]):
-            places[found] = u
-            found += two[v, u]
-        for i in range(found):
-            for k in range(n):
-                measures[k, begin + i] = pixels[k, v, places[i]]
-            for k in range(m):
-                measures[n + k, begin + i] = cells[k, row, min(places[i] // 2, cols - 1)]
-        begin += found
-    return measures
+def _twice(cells: Vector, line: Vector) -> None:
+    """A row of cells on a row of pixels."""
+    for col in range(len(cells)):
+        line[2 * col] = line[2 * col + 1] = cells[col]
+    line[len(line) - 1] = cells[len(cells) - 1]
 
 
 @compiled
-def _put(field: Field, where: Mask, figures: Vector) -> None:
-    i = 0
-    for v in range(len(where)):
-        for u in range(where.shape[1]):
-            if where[v, u]:
-                field[v, u] = figures[i]
-                i += 1
+def _places(two: Bool[np.ndarray, "w"], places: Int[np.ndarray, "w"]) -> int:
+    """The columns of a row where surfaces compete; how many there are."""
+    found = 0
+    for u in range(len(two)):
+        places[found] = u
+        found += two[u]
+    return found
+
+
+@compiled
+def _contested(pixels: Pixels, cells: OfCells, v: int, places: Int[np.ndarray, "n"], measures: Measures) -> None:
+    """All measures of a row's pixels at `places`."""
+    n, (m, rows, cols) = len(pixels), cells.shape
+    row = min(v // 2, rows - 1)
+    for k in range(n):
+        for i in range(len(places)):
+            measures[k, i] = pixels[k, v, places[i]]
+    for k in range(m):
+        for i in range(len(places)):
+            measures[n + k, i] = cells[k, row, min(places[i] // 2, cols - 1)]
 
 
 def believed(disparity: Disparity, trust: Trust, max_risk: float) -> Mask:
@@ -140,12 +156,8 @@ def believed(disparity: Disparity, trust: Trust, max_risk: float) -> Mask:
 
 
 def speckled(disparity: Disparity, sound: Mask, speckle_px: int) -> Mask:
-    """The sound pixels in islands of fewer than `speckle_px`; within an island neighbours differ by 2 px at most."""
-    if not speckle_px:
-        return np.zeros(sound.shape, dtype=bool)
-    fixed = np.where(sound, disparity * 16, -16).astype(np.int16)
-    cv2.filterSpeckles(fixed, -16, speckle_px, 32)
-    return np.asarray(sound & (fixed < 0))
+    """The sound pixels in islands of up to `speckle_px`; within an island neighbours differ by 2 px at most."""
+    return islands.small(disparity, sound, speckle_px)
 
 
 def _log_odds(risk: float) -> float:
