@@ -1,11 +1,13 @@
 """What the parts of a result share, and its bin: frozen messages, metres and radians, unknown keys and NaN refused."""
 
 import math
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, field_validator
 
 Triple = tuple[float, float, float]
 Xyzw = tuple[float, float, float, float]
+Metering = Literal["", "settled", "too_dark", "too_bright", "unsteady"]
 
 
 class Wire(BaseModel):
@@ -82,6 +84,26 @@ class SyncMessage(Wire):
     exposure_us: float = 0.0
     gain_db: float = 0.0
     arrival_ms: float = 0.0
+
+
+class ShotMessage(Wire):
+    """What the left and the right camera really exposed one shot with, as read back from them."""
+
+    projector: bool
+    pattern: int
+    exposure_us: tuple[float, float]
+    gain_db: tuple[float, float]
+
+
+class LightMessage(Wire):
+    """The shots of a cycle, in order.
+
+    `metering` says what auto exposure came to, "" without it: settled; too_dark or too_bright, when the limits of exposure and
+    gain did not let it; unsteady, when the brightness changed from one test shot to the next.
+    """
+
+    metering: Metering
+    shots: tuple[ShotMessage, ...]
 
 
 class RecipeMessage(Wire):

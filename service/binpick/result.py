@@ -3,17 +3,27 @@
 A `Result` is serialised once to bytes; REST sends those, the registers are filled from the same object. Metres, radians.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from binpick import geometry
-from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
+from binpick.data import CameraStatus, Depth, Image, Light, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.errors import Code
 from binpick.geometry import Transform
-from binpick.message import BinMessage, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
+from binpick.message import (
+    BinMessage,
+    LightMessage,
+    Metering,
+    PoseMessage,
+    RecipeMessage,
+    SyncMessage,
+    Triple,
+    Wire,
+    Xyzw,
+)
 from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.rig import Rig
 from binpick.settings import Job
@@ -162,6 +172,7 @@ class Result(Wire):
     """With a mesh: parts in the order of their grasps. They say where a part lies; only `grasps` are to be moved by."""
     funnel: Funnel | None = None
     sync: SyncMessage | None = None
+    light: LightMessage | None = None
     timing_ms: dict[str, float] = Field(default_factory=dict)
     inputs: Inputs | None = None
 
@@ -198,7 +209,7 @@ def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, s
 class CycleInput:
     """Everything that one cycle reads; stored together with its result it is a recording.
 
-    `pair` is the recipe's first shot, `more` are the others in order; `job.recipe.lights` says what each was exposed with.
+    `pair` is the recipe's first shot, `more` are the others in order; `lights` says what each was exposed with.
     """
 
     cycle_id: int
@@ -210,6 +221,14 @@ class CycleInput:
     more: tuple[StereoPair, ...] = ()
     memory: Memory = NO_MEMORY
     """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
+    metering: Metering = ""
+    """What auto exposure came to; "" without it."""
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """What each shot was exposed with: as the recipe says, metered ones as the left camera was set."""
+        return tuple(replace(light, exposure_us=pair.left.exposure_us, gain_db=pair.left.gain_db) if light.metered else light
+                     for light, pair in zip(self.job.recipe.lights, self.pairs, strict=True))
 
     @property
     def pairs(self) -> tuple[StereoPair, ...]:
@@ -242,6 +261,8 @@ class CycleResult:
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
     T_camera_bin: Transform | None = None
+    shown: Image | None = None
+    """The window of the left view without the pattern, for people, where a shot was taken so."""
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:

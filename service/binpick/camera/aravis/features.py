@@ -34,9 +34,22 @@ class Features:
             if found != step.value:
                 raise self._unlike(step, found, refusal)
 
+    def bounds(self, feature: str) -> tuple[float, float]:
+        """The least and the most that the camera takes now. Raises CameraError, CameraLost."""
+        _, glib = library.load()
+        try:
+            low, high = self._camera.get_float_bounds(feature)
+        except glib.Error as error:
+            raise library.translated(error, self._name, f"reading the range of {feature}") from None
+        return float(low), float(high)
+
     def approach(self, feature: str, wanted: float, tolerance: float) -> float:
-        """Sets a number that the camera may round; what it is now. Raises as `apply` does."""
+        """Sets a number that the camera may round, not clamp; what it is now. Raises as `apply` does."""
         step = Step(feature, float(wanted))
+        low, high = self.bounds(feature)
+        if not low <= wanted <= high:
+            raise CameraError(f"camera {self._name}: {feature} should be {wanted:g}, but this camera's range is {low:g} to "
+                              f"{high:g}: check the recipe", self._name)
         refusal = self._write(step)
         found = self._found(step)
         if found is None or abs(float(found) - wanted) > tolerance:
