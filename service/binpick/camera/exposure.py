@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from binpick.data import Image
 from binpick.message import Metering
 from binpick.settings.recipe import AutoExposure
 
+Window = UInt8[np.ndarray, "_ _"]
 SATURATED, BLACK = 250, 3
 """Grey levels from which a level says only that there is too much light, and up to which only that there is too little."""
 TOLERANCE = 0.1
@@ -76,17 +77,20 @@ def step(search: Search, level: float, wanted: AutoExposure, limits: Limits) -> 
     factor = min(max(factor, LEAST_FACTOR), MOST_FACTOR)
     direction = (1 if factor > 1 else -1) if known else 0
     after = replace(search, level=level, wished=(*search.wished, search.light * factor), direction=direction)
-    if abs(level / wanted.target_grey - 1) <= TOLERANCE:
-        after = replace(after, steady=search.steady + 1)
-        return replace(after, outcome="settled") if after.steady >= STEADY else after
+    right = abs(level / wanted.target_grey - 1) <= TOLERANCE
+    after = replace(after, steady=search.steady + 1 if right else 0)
+    if after.steady >= STEADY:
+        return replace(after, outcome="settled")
     if len(after.wished) >= MOST_SHOTS:
         exposure_us, gain_db = limits.split(float(np.exp(np.median(np.log(after.wished[MOST_SHOTS // 2:])))))
         return replace(after, exposure_us=exposure_us, gain_db=gain_db, outcome="unsteady", level=wanted.target_grey)
+    if right:
+        return after
     half = search.direction * direction < 0 or search.steady > 0
     exposure_us, gain_db = limits.split(search.light * (math.sqrt(factor) if half else factor))
     if (exposure_us, gain_db) == (search.exposure_us, search.gain_db):
         return replace(after, outcome="too_dark" if factor > 1 else "too_bright")
-    return replace(after, exposure_us=exposure_us, gain_db=gain_db, steady=0)
+    return replace(after, exposure_us=exposure_us, gain_db=gain_db)
 
 
 def drifted(search: Search, level: float, wanted: AutoExposure) -> bool:
@@ -95,11 +99,11 @@ def drifted(search: Search, level: float, wanted: AutoExposure) -> bool:
     return not 1 / (1 + wanted.drift) <= max(level, BLACK) / usual <= 1 + wanted.drift
 
 
-def level(images: tuple[Image, ...], percentile: float) -> float:
+def level(images: tuple[Window, ...], percentile: float) -> float:
     """The grey level that this share of the pixels (%) does not exceed, of the brightest image."""
     return max(_level(image, percentile) for image in images)
 
 
-def _level(image: Image, percentile: float) -> float:
+def _level(image: Window, percentile: float) -> float:
     counts = np.cumsum(cv2.calcHist([np.ascontiguousarray(image)], [0], None, [256], [0, 256])[:, 0].astype(np.int64))
     return float(np.searchsorted(counts, percentile / 100 * counts[-1]))

@@ -6,7 +6,7 @@ from typing import Literal
 
 from binpick.settings.recipe import Recipe
 
-RANGES: dict[Literal["exposure_range_us", "gain_range_db"], str] = {"exposure_range_us": "ExposureTime", "gain_range_db": "Gain"}
+RANGES = {"exposure_range_us": "ExposureTime", "gain_range_db": "Gain"}
 """The features (SFNC) behind the ranges of `CameraStatus`."""
 
 

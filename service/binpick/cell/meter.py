@@ -10,7 +10,7 @@ import numpy as np
 from binpick import geometry
 from binpick.camera import exposure
 from binpick.camera.exposure import Limits, Search
-from binpick.data import CameraStatus, Image, Light, StereoPair
+from binpick.data import CameraStatus, Light, StereoPair
 from binpick.frames import Frames
 from binpick.geometry import Transform
 from binpick.message import Metering
@@ -23,6 +23,7 @@ NEAR_M = 0.05
 """Nearer to a camera its picture of the bin says nothing."""
 LEAST_PX = 16
 """A window with fewer pixels along a side cannot be what the cell file means."""
+EVERYWHERE = slice(None), slice(None)
 
 log = logging.getLogger(__name__)
 Capture = Callable[[Light], StereoPair]
@@ -82,7 +83,7 @@ class Meter:
 
     def _level(self, job: Job, request: Request, pair: StereoPair) -> float:
         T_camera_bin = Frames.of(CycleInput(0, pair, self._rig, job, request)).T_camera_bin
-        images = tuple(_window(frame.image, camera, T_camera_bin, job.bin.inner_size_m)
+        images = tuple(frame.image[_window(frame.image.shape, camera, T_camera_bin, job.bin.inner_size_m)]
                        for frame, camera in zip(pair.frames, self._rig.cameras, strict=False))
         return exposure.level(images, job.recipe.auto.percentile)
 
@@ -107,19 +108,20 @@ def _anew(search: Search) -> Search:
     return Search(search.exposure_us, search.gain_db)
 
 
-def _window(image: Image, camera: RigCamera, T_camera_bin: Transform, inner_size_m: tuple[float, float, float]) -> Image:
-    """The part of an image that shows the bin; all of it when the bin is not in it."""
+def _window(shape: tuple[int, ...], camera: RigCamera, T_camera_bin: Transform, inner_size_m: tuple[float, float, float],
+            ) -> tuple[slice, slice]:
+    """Rows and columns of an image that show the bin; all of them when the bin is not in it."""
     length, width, height = inner_size_m
     box = geometry.box_corners(np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height]))
     corners = geometry.transform(camera.T_camera_rig @ T_camera_bin, box)
     if corners[:, 2].min() < NEAR_M:
-        return image
+        return EVERYWHERE
     pixels = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), camera.K_px, camera.distortion_coefficients)[0].reshape(-1, 2)
-    (left, top), (right, bottom) = (np.clip(edge, 0, image.shape[::-1]).astype(int)
+    (left, top), (right, bottom) = (np.clip(edge, 0, shape[::-1]).astype(int).tolist()
                                     for edge in (pixels.min(axis=0), pixels.max(axis=0)))
     if min(right - left, bottom - top) < LEAST_PX:
-        return image
-    return image[top:bottom, left:right]
+        return EVERYWHERE
+    return slice(top, bottom), slice(left, right)
 
 
 def _told(projector: bool, search: Search, level: float) -> str:
