@@ -11,7 +11,6 @@ from binpick.grasp import gate
 from binpick.message import (
     BinMessage,
     FillCellMessage,
-    LightMessage,
     PoseMessage,
     RecipeMessage,
     RimMessage,
@@ -127,8 +126,8 @@ def answer(inputs: CycleInput, frames: Frames, timing_ms: dict[str, float], code
         grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
         sync=SyncMessage(skew_us=worst.skew_us, sigma_us=worst.sigma_us, proof=worst.proof,
                          resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every),
-                         exposure_us=worst.left.exposure_us, gain_db=worst.left.gain_db, arrival_ms=round(worst.arrival_ms, 3)),
-        light=LightMessage(metering=inputs.metering, shots=tuple(map(_shot, inputs.lights, inputs.pairs))),
+                         exposure_us=worst.left.exposure_us, gain_db=worst.left.gain_db, arrival_ms=round(worst.arrival_ms, 3),
+                         metering=inputs.metering, shots=tuple(map(_shot, inputs.lights, inputs.pairs))),
         timing_ms=timing_ms,
         inputs=Inputs(rig_sha256=inputs.rig.sha256, settings_sha256=job.sha256,
                       frame_ids=(pair.left.frame_id, pair.right.frame_id),

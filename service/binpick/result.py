@@ -13,17 +13,7 @@ from binpick import geometry
 from binpick.data import CameraStatus, Depth, Image, Light, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.errors import Code
 from binpick.geometry import Transform
-from binpick.message import (
-    BinMessage,
-    LightMessage,
-    Metering,
-    PoseMessage,
-    RecipeMessage,
-    SyncMessage,
-    Triple,
-    Wire,
-    Xyzw,
-)
+from binpick.message import BinMessage, Metering, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
 from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.rig import Rig
 from binpick.settings import Job
@@ -172,7 +162,6 @@ class Result(Wire):
     """With a mesh: parts in the order of their grasps. They say where a part lies; only `grasps` are to be moved by."""
     funnel: Funnel | None = None
     sync: SyncMessage | None = None
-    light: LightMessage | None = None
     timing_ms: dict[str, float] = Field(default_factory=dict)
     inputs: Inputs | None = None
 
@@ -209,7 +198,7 @@ def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, s
 class CycleInput:
     """Everything that one cycle reads; stored together with its result it is a recording.
 
-    `pair` is the recipe's first shot, `more` are the others in order; `lights` says what each was exposed with.
+    `pair` is the recipe's first shot, `more` are the others; `metering` says what auto exposure came to.
     """
 
     cycle_id: int
@@ -222,11 +211,10 @@ class CycleInput:
     memory: Memory = NO_MEMORY
     """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
     metering: Metering = ""
-    """What auto exposure came to; "" without it."""
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        """What each shot was exposed with: as the recipe says, metered ones as the left camera was set."""
+        """As the recipe says; metered ones as the left camera was set."""
         return tuple(replace(light, exposure_us=pair.left.exposure_us, gain_db=pair.left.gain_db) if light.metered else light
                      for light, pair in zip(self.job.recipe.lights, self.pairs, strict=True))
 
@@ -261,8 +249,7 @@ class CycleResult:
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
     T_camera_bin: Transform | None = None
-    shown: Image | None = None
-    """The window of the left view without the pattern, for people, where a shot was taken so."""
+    shown: Image | None = None      # the window of the left view without the pattern, where a shot was taken so
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
