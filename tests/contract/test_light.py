@@ -149,18 +149,19 @@ def test_metering_stays_within_the_cameras_range_which_its_status_tells(
     with bench(gige_addresses, Scene(lamp=100.0)) as cell:
         assert {status.exposure_range_us for status in cell.group.statuses()} == {(100.0, 20_000.0)}
         settled, (pair,), _ = cell.cycle(job(exposure_us="auto"))
-        assert (settled.outcome, pair.left.exposure_us) == ("too_bright", 100.0)
+        assert (settled.outcome, pair.left.exposure_us) == ("too_bright", 105.0)          # as it is, not as it was asked for
         with pytest.raises(CameraError, match="ExposureTime should be 50, but this camera's range is 100 to 20000"):
             cell.group.capture(Light(50.0, 0.0, projector=False), within(5))
 
 
 def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras of another model, that expose 0.1 to 20 ms with at most 12 dB."""
+    """Cameras of another model, that expose 0.1 to 20 ms, in steps of 7 µs, with at most 12 dB."""
     usual = features.table
     ranges = {"ExposureTime": (100, 20_000), "Gain": (0, 12)}
 
     def table(width: int, height: int, serial: str) -> list[features.Feature]:
-        return [replace(row, minimum=ranges[row.name][0], maximum=ranges[row.name][1]) if row.name in ranges else row
+        return [replace(row, minimum=ranges[row.name][0], maximum=ranges[row.name][1],
+                        increment=7.0 if row.name == "ExposureTime" else 0.0) if row.name in ranges else row
                 for row in usual(width, height, serial)]
 
     monkeypatch.setattr(features, "table", table)

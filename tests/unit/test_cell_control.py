@@ -337,9 +337,9 @@ def test_auto_exposure_is_found_before_the_first_cycle_and_its_test_shots_are_ne
         auto = Recipe(frame="camera", exposure_us="auto", projector="alternate")
         async with living(cameras, run, recipes=[auto]) as cell:
             assert not cameras.captures                            # before a trigger the robot may stand in the way
-            for number in (1, 2):
-                cell.start(Request(), "rest")
-                await until(cell, lambda s: s.phase == "ready" and len(seen) == number)
+            for _ in range(2):
+                started = cell.start(Request(), "rest")
+                await until(cell, lambda s, started=started: s.valid and s.latest.result.cycle_id == started)
         first, second = seen
         assert [inputs.metering for inputs in seen] == ["too_dark", "too_dark"]          # these cameras see nothing at all
         assert [len(inputs.pairs) for inputs in seen] == [2, 2]
