@@ -3,12 +3,20 @@
 from dataclasses import asdict
 
 from binpick import geometry
-from binpick.data import Grasp, PartPose
+from binpick.data import Grasp, Light, PartPose, StereoPair
 from binpick.errors import Code
 from binpick.frames import Frames
 from binpick.geometry import Transform
 from binpick.grasp import gate
-from binpick.message import BinMessage, FillCellMessage, PoseMessage, RecipeMessage, RimMessage, SyncMessage
+from binpick.message import (
+    BinMessage,
+    FillCellMessage,
+    PoseMessage,
+    RecipeMessage,
+    RimMessage,
+    ShotMessage,
+    SyncMessage,
+)
 from binpick.result import (
     CycleInput,
     Funnel,
@@ -118,11 +126,18 @@ def answer(inputs: CycleInput, frames: Frames, timing_ms: dict[str, float], code
         grasps=grasps, funnel=Funnel(counts=counts or {}, dominating=max(lost, key=lambda k: lost[k]) if lost else ""),
         sync=SyncMessage(skew_us=worst.skew_us, sigma_us=worst.sigma_us, proof=worst.proof,
                          resends=sum(frame.resends for frame in every), missing=sum(frame.missing for frame in every),
-                         exposure_us=worst.left.exposure_us, gain_db=worst.left.gain_db, arrival_ms=round(worst.arrival_ms, 3)),
+                         exposure_us=worst.left.exposure_us, gain_db=worst.left.gain_db, arrival_ms=round(worst.arrival_ms, 3),
+                         metering=inputs.metering, shots=tuple(map(_shot, inputs.lights, inputs.pairs))),
         timing_ms=timing_ms,
         inputs=Inputs(rig_sha256=inputs.rig.sha256, settings_sha256=job.sha256,
                       frame_ids=(pair.left.frame_id, pair.right.frame_id),
                       recipe=RecipeMessage(number=job.recipe.number, name=job.recipe.name, sha256=job.recipe_sha256)))
+
+
+def _shot(light: Light, pair: StereoPair) -> ShotMessage:
+    return ShotMessage(projector=light.projector, pattern=light.pattern,
+                       exposure_us=(pair.left.exposure_us, pair.right.exposure_us),
+                       gain_db=(pair.left.gain_db, pair.right.gain_db))
 
 
 def _bin(job: Job, frames: Frames, filled: load_carrier.Filling | None) -> BinMessage:

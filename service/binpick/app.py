@@ -101,7 +101,7 @@ def cameras(cell: settings.Cell) -> Cameras:
     """The cell file's cameras as a group, not yet open."""
     from binpick.camera import backends
 
-    return backends.group(cell.cameras)
+    return backends.group(cell.cameras, cell.recipes)
 
 
 def run(cell: settings.Cell, rig: Rig, cameras: Cameras) -> None:

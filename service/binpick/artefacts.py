@@ -83,7 +83,8 @@ def _overlay(inputs: CycleInput, cycle: CycleResult) -> bytes:
     result = cycle.result
     if cycle.rectified is None:
         return _png(_captioned(_colour(inputs.pair.left.image), _sentence(result.return_code), _banner(result.return_code)))
-    picture = _colour(cv2.LUT(cycle.rectified.left[:, cycle.rectified.margin:], BRIGHTER))
+    seen = cycle.shown if cycle.shown is not None else cycle.rectified.left[:, cycle.rectified.margin:]
+    picture = _colour(cv2.LUT(seen, BRIGHTER))
     if cycle.segments is not None:
         picture = _tinted(picture, cycle.segments.parts)
     if result.bin is not None and result.bin.T_camera_bin is not None:

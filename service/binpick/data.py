@@ -33,12 +33,16 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """What a shot is exposed with; `pattern` is the place in a programmable projector's sequence, 0: the random dots."""
+    """What a shot is exposed with; `pattern` is the place in a programmable projector's sequence, 0: the random dots.
+
+    `metered`: exposure and gain are only where auto exposure begins.
+    """
 
     exposure_us: float
     gain_db: float
     projector: bool
     pattern: int = 0
+    metered: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +105,7 @@ class CameraStatus:
     """What a camera says of itself; `error` is empty when it is well.
 
     `ptp` is the camera's PtpStatus ("": it has none), `ptp_offset_us` its distance from the master, to 0.1 µs; `refused` the
-    pairs refused since the start, of all cameras together.
+    pairs refused since the start, of all cameras together. The ranges are the camera's own, null while they are not known.
     """
 
     name: str
@@ -118,6 +122,8 @@ class CameraStatus:
     ptp_offset_us: float = 0.0
     packet_size: int = 0
     refused: int = 0
+    exposure_range_us: tuple[float, float] | None = None
+    gain_range_db: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,13 @@
 """What the parts of a result share, and its bin: frozen messages, metres and radians, unknown keys and NaN refused."""
 
 import math
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, field_validator
 
 Triple = tuple[float, float, float]
 Xyzw = tuple[float, float, float, float]
+Metering = Literal["", "settled", "too_dark", "too_bright", "unsteady"]
 
 
 class Wire(BaseModel):
@@ -67,11 +69,22 @@ class BinMessage(Wire):
     rim: RimMessage | None = None
 
 
+class ShotMessage(Wire):
+    """What the left and the right camera really exposed one shot with, as read back from them."""
+
+    projector: bool
+    pattern: int
+    exposure_us: tuple[float, float]
+    gain_db: tuple[float, float]
+
+
 class SyncMessage(Wire):
     """How well the images are proved to show one instant, and what they were taken with.
 
     `proof` is ptp, latch (device clocks compared with the host's), interval (the host's times alone) or none; `arrival_ms` is
-    from the trigger until all images were here.
+    from the trigger until all images were here. `metering` says what auto exposure came to, "" without it: settled; too_dark or
+    too_bright, when the limits of exposure and gain did not let it; unsteady, when the brightness changed from one test shot to
+    the next.
     """
 
     skew_us: float
@@ -82,6 +95,8 @@ class SyncMessage(Wire):
     exposure_us: float = 0.0
     gain_db: float = 0.0
     arrival_ms: float = 0.0
+    metering: Metering = ""
+    shots: tuple[ShotMessage, ...] = ()
 
 
 class RecipeMessage(Wire):

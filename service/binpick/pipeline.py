@@ -12,7 +12,7 @@ from jaxtyping import Float32
 
 from binpick import geometry
 from binpick.answer import answer, code_of, part_messages, publishable
-from binpick.data import Depth, Grasp, HeightMap, OrganisedCloud, PartPose, Rectified, Segments
+from binpick.data import Depth, Grasp, HeightMap, Image, Light, OrganisedCloud, PartPose, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
 from binpick.geometry import Transform, Vector
@@ -101,8 +101,15 @@ def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
         view = rectify.visible(rect, inputs.rig, rectify.window(rect, frames.T_camera_bin, *box))
         shots = tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
     with clock.stage("match"):
-        rectified, depth = stereo.of_shots(shots, inputs.job.recipe.lights, inputs.job.recipe.stereo)
-    return _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
+        rectified, depth = stereo.of_shots(shots, inputs.lights, inputs.job.recipe.stereo)
+    cycle = _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
+    return replace(cycle, shown=_shown(shots, inputs.lights))
+
+
+def _shown(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> Image | None:
+    """The window of the left view in the first shot without the pattern, unless all are."""
+    plain = [shot for shot, light in zip(shots, lights, strict=True) if not light.projector]
+    return plain[0].left[:, plain[0].margin:] if plain and lights[0].projector else None
 
 
 def _scene(inputs: CycleInput, frames: Frames, clock: "_Clock", rectified: Rectified, depth: Depth,

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 from binpick import __version__, rig
 from binpick.data import Frame, Image, StereoPair, frozen
 from binpick.errors import ImageError, InputError
-from binpick.message import Wire
+from binpick.message import Metering, Wire
 from binpick.outcomes import NO_MEMORY, Memory
 from binpick.result import CycleInput, Request, Result
 from binpick.settings import Job
@@ -78,6 +78,8 @@ class InputFile(PairFacts):
     """The shots after the first, in order."""
     memory: Memory = NO_MEMORY
     """What was remembered of the bin before the cycle."""
+    metering: Metering = ""
+    """What auto exposure came to."""
 
 
 def folder_name(inputs: CycleInput) -> str:
@@ -111,12 +113,12 @@ def load(folder: Path) -> tuple[CycleInput, Result]:
     facts = _parse(folder / "input.json", InputFile)
     used_rig, _ = rig.load(folder / "rig.json")
     job = _parse(folder / "job.json", Job)
-    if len(job.recipe.shots) != 1 + len(facts.more):
+    if len(job.recipe.lights) != 1 + len(facts.more):
         raise InputError(f"{folder / 'input.json'}: not a whole recording: {1 + len(facts.more)} shots, but the recipe in "
-                         f"job.json has {len(job.recipe.shots)}")
+                         f"job.json has {len(job.recipe.lights)}")
     pair, *more = (_pair(folder, number, shot) for number, shot in enumerate((facts, *facts.more), start=1))
     inputs = CycleInput(facts.cycle_id, pair, used_rig, job, facts.request, facts.simulated, tuple(more),
-                        facts.memory)
+                        facts.memory, facts.metering)
     return inputs, _parse(folder / "result.json", Result)
 
 
@@ -124,8 +126,8 @@ def _files(inputs: CycleInput, result: Result) -> dict[str, bytes]:
     facts = InputFile(
         made_with={"binpick": __version__, "opencv": cv2.__version__, "numpy": np.__version__, "machine": platform.machine()},
         cycle_id=inputs.cycle_id, request=inputs.request, simulated=inputs.simulated, **dict(_pair_facts(inputs.pair)),
-        more=tuple(map(_pair_facts, inputs.more)), memory=inputs.memory)
-    absent = {name for name, value in (("more", inputs.more), ("memory", inputs.memory)) if value in ((), NO_MEMORY)}
+        more=tuple(map(_pair_facts, inputs.more)), memory=inputs.memory, metering=inputs.metering)
+    absent = {name for name in ("more", "memory", "metering") if getattr(inputs, name) in ((), NO_MEMORY, "")}
     images = {_name(side, number): _png(frame.image) for number, pair in enumerate(inputs.pairs, start=1)
               for side, frame in (("left", pair.left), ("right", pair.right))}
     return images | {

@@ -4,17 +4,17 @@ A `Result` is serialised once to bytes; REST sends those, the registers are fill
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from binpick import geometry
-from binpick.data import CameraStatus, Depth, OrganisedCloud, Rectified, Segments, StereoPair
+from binpick.data import CameraStatus, Depth, Image, Light, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.errors import Code
 from binpick.geometry import Transform
-from binpick.message import BinMessage, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
+from binpick.message import BinMessage, Metering, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
 from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.rig import Rig
 from binpick.settings import Job
@@ -199,7 +199,7 @@ def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, s
 class CycleInput:
     """Everything that one cycle reads; stored together with its result it is a recording.
 
-    `pair` is the recipe's first shot, `more` are the others in order; `job.recipe.lights` says what each was exposed with.
+    `pair` is the recipe's first shot, `more` are the others; `metering` says what auto exposure came to.
     """
 
     cycle_id: int
@@ -211,6 +211,13 @@ class CycleInput:
     more: tuple[StereoPair, ...] = ()
     memory: Memory = NO_MEMORY
     """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
+    metering: Metering = ""
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """As the recipe says; metered ones as the left camera was set."""
+        return tuple(replace(light, exposure_us=pair.left.exposure_us, gain_db=pair.left.gain_db) if light.metered else light
+                     for light, pair in zip(self.job.recipe.lights, self.pairs, strict=True))
 
     @property
     def pairs(self) -> tuple[StereoPair, ...]:
@@ -244,6 +251,7 @@ class CycleResult:
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
     T_camera_bin: Transform | None = None
+    shown: Image | None = None      # the window of the left view without the pattern, where a shot was taken so
 
     @property
     def cloud(self) -> OrganisedCloud | None:

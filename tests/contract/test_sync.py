@@ -166,7 +166,7 @@ def test_what_the_camera_does_not_accept_is_named_before_the_first_image(gige_ad
 
 
 def test_light_that_the_camera_cannot_give_is_named(gige_addresses: tuple[str, str]) -> None:
-    wrong = r"left: Gain should be 40.0, but is 0.0 \(.*invalid"
+    wrong = "left: Gain should be 40, but this camera's range is 0 to 24"
     with cell(gige_addresses) as (_, group), pytest.raises(CameraError, match=wrong):
         group.capture(replace(LIGHT, gain_db=40.0), within(3))
 

@@ -326,6 +326,32 @@ def test_all_shots_are_taken_in_order_before_the_images_count_as_acquired() -> N
     asyncio.run(scenario())
 
 
+def test_auto_exposure_is_found_before_the_first_cycle_and_its_test_shots_are_never_matched() -> None:
+    async def scenario() -> None:
+        cameras, seen = released(), []
+
+        def run(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
+            seen.append(inputs)
+            return good(inputs, proceed)
+
+        auto = Recipe(frame="camera", exposure_us="auto", projector="alternate")
+        async with living(cameras, run, recipes=[auto]) as cell:
+            assert not cameras.captures                            # before a trigger the robot may stand in the way
+            for _ in range(2):
+                started = cell.start(Request(), "rest")
+                await until(cell, lambda s, started=started: s.valid and s.latest.result.cycle_id == started)
+        first, second = seen
+        assert [inputs.metering for inputs in seen] == ["too_dark", "too_dark"]          # these cameras see nothing at all
+        assert [len(inputs.pairs) for inputs in seen] == [2, 2]
+        tests = len(cameras.captures) - 4
+        assert 4 <= tests <= 10
+        assert [light.projector for light in cameras.captures[tests:]] == [True, False] * 2
+        longest = auto.auto.longest_us, auto.auto.highest_gain_db
+        assert {(light.exposure_us, light.gain_db) for light in (*first.lights, *second.lights)} == {longest}
+
+    asyncio.run(scenario())
+
+
 def test_a_later_shot_that_is_stale_fails_the_cycle() -> None:
     async def scenario() -> None:
         cameras = released()

@@ -181,7 +181,11 @@ def test_several_shots_are_measured_together(several, outcome):
     assert abs(float(result.depth.measured.mean()) - float(outcome.depth.measured.mean())) < 0.1
     both = result.depth.measured & outcome.depth.measured
     assert np.median(np.abs(result.depth.disparity - outcome.depth.disparity)[both]) < 0.2
+    assert result.shown.shape == result.depth.disparity.shape            # people see the shot without the pattern
+    assert result.shown.mean() < 0.6 * outcome.rectified.left.mean()
+    assert outcome.shown is None
     sync = result.result.sync
+    assert [shot.projector for shot in sync.shots] == [True, True, False]
     assert (sync.skew_us, sync.resends) == (-80.0, 3)          # the worst pair's, and all of them
 
 

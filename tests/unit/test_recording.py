@@ -63,7 +63,7 @@ def test_what_comes_back_is_what_went_in(tmp_path: Path) -> None:
         "input.json", "job.json", "left.png", "result.json", "rig.json", "right.png"]
     facts = json.loads((tmp_path / "one" / "input.json").read_text())
     assert set(facts["made_with"]) == {"binpick", "opencv", "numpy", "machine"}
-    assert not {"more", "memory"} & set(facts)            # as before there were shots and outcomes
+    assert not {"more", "memory", "metering"} & set(facts)            # as before there were shots and outcomes
 
 
 def test_a_recording_computes_to_the_same_bytes(tmp_path: Path) -> None:
@@ -105,6 +105,24 @@ def test_every_shot_of_a_cycle_is_kept_and_computes_to_the_same_bytes(tmp_path: 
         assert np.array_equal(before.right.image, after.right.image)
         assert (before.skew_us, before.captured_at) == (after.skew_us, after.captured_at)
     assert pipeline.run(got).result.timeless_bytes() == live.timeless_bytes()
+
+
+def test_what_auto_exposure_found_is_in_it_and_in_the_answer(tmp_path: Path) -> None:
+    given = inputs()
+    recipe = Recipe.model_validate(given.job.recipe.model_dump() | {"exposure_us": "auto", "projector": "alternate", "hdr": 4})
+    times = (2000.0, 500.0, 9000.0, 2250.0)
+    pairs = [replace(pair, left=replace(pair.left, exposure_us=time_us), right=replace(pair.right, exposure_us=time_us + 1))
+             for pair, time_us in ((inputs(seed=seed).pair, time_us) for seed, time_us in enumerate(times))]
+    given = replace(given, pair=pairs[0], more=tuple(pairs[1:]), metering="too_dark",
+                    job=given.job.model_copy(update={"recipe": recipe}))
+    assert [light.exposure_us for light in given.lights] == list(times)
+    live = pipeline.run(given).result
+    assert live.sync is not None
+    assert live.sync.metering == "too_dark"
+    assert [(shot.projector, shot.exposure_us) for shot in live.sync.shots] == [
+        (on, (time_us, time_us + 1)) for on, time_us in zip((True, True, False, False), times, strict=True)]
+    recording.save(tmp_path / "one", given, live)
+    assert pipeline.run(recording.load(tmp_path / "one")[0]).result.timeless_bytes() == live.timeless_bytes()
 
 
 @pytest.mark.parametrize(("name", "error"), [("right-03.png", ImageError), ("left-02.png", ImageError)])

@@ -44,6 +44,13 @@ def test_only_a_bin_is_required():
     (BIN + "recipes: [{shots: [{projector: false}, {}]}]\n", "the first must have the projector on"),
     (BIN + "recipes: [{projector: false, shots: [{pattern: 1}]}]\n", "a pattern needs the projector"),
     (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{shots: [{}, {}]}]\n", "are one shot, not 2"),
+    (BIN + "recipes: [{exposure_us: often}]\n", "recipes.0.exposure_us"),
+    (BIN + "recipes: [{projector: sometimes}]\n", "recipes.0.projector"),
+    (BIN + "recipes: [{exposure_us: auto, hdr: 4, shots: [{pattern: 1}]}]\n", "exposure_us: auto and hdr: not with numbered"),
+    (BIN + "recipes: [{exposure_us: auto, gain_db: 9}]\n", "gain_db 9 is above auto.highest_gain_db 6"),
+    (BIN + "recipes: [{exposure_us: auto, shots: [{gain_db: 2}]}]\n", "needs its own exposure_us"),
+    (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{hdr: 4}]\n", "are one shot, not 2"),
+    (BIN + "cameras: {backend: files, left: l.png, right: r.png}\nrecipes: [{exposure_us: auto}]\n", "needs cameras"),
     (BIN + "gripper: {cups: [{x_m: 0.01}]}\n", "the TCP must be the middle of the cups"),
     (BIN + "gripper: {wrist: {turns: 2}}\n", "turns: unknown key"),
     (BIN.replace("[0, 0, 1]", "[0, 0, 1], rotvec_rad: [0, 0, 0], kuka_abc_deg: [0, 0, 0]"), "exactly one orientation"),
@@ -52,6 +59,21 @@ def test_only_a_bin_is_required():
 def test_an_error_says_where_and_what(text, says):
     with pytest.raises(SettingsError, match=says):
         settings.parse(text, "cell.yaml")
+
+
+@pytest.mark.parametrize(("recipe", "expected"), [
+    ("{exposure_us: 5000, hdr: 4}", [(5000, True, False), (1250, True, False)]),
+    ("{exposure_us: 5000, projector: alternate}", [(5000, True, False), (5000, False, False)]),
+    ("{exposure_us: 5000, projector: alternate, shots: [{}, {projector: false, exposure_us: 900}]}",
+     [(5000, True, False), (900, False, False)]),
+    ("{projector: alternate, hdr: 2}", [(6000, True, False), (3000, True, False), (6000, False, False), (3000, False, False)]),
+    ("{exposure_us: 30, hdr: 30}", [(30, True, False), (20, True, False)]),
+    ("{exposure_us: auto, hdr: 3, shots: [{}, {exposure_us: 900}]}",
+     [(6000, True, True), (2000, True, True), (900, True, False), (300, True, False)])])
+def test_one_setting_makes_several_shots(recipe, expected):
+    taken = settings.resolve(settings.parse(BIN + f"recipes: [{recipe}]", "cell.yaml")).recipe
+    assert [(light.exposure_us, light.projector, light.metered) for light in taken.lights] == expected
+    assert [light.exposure_us for light in taken.single.lights] == [expected[0][0]]
 
 
 def test_a_shot_is_exposed_as_the_recipe_says_unless_it_says_otherwise():

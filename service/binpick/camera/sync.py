@@ -17,6 +17,8 @@ class Step:
     secret: bool = False
 
 
+PROJECTOR_LINE = "Line2"
+"""The Alvium's opto-isolated output, which strobes the projector."""
 GROUP = 1
 """The action's group key and mask: the device key alone tells our cameras from others."""
 
@@ -43,6 +45,10 @@ def steps(cameras: AravisCameras, first: bool) -> tuple[Step, ...]:
         Step("GevHeartbeatTimeout", cameras.heartbeat_ms),
         Step("PtpEnable", True, optional=True),
         Step("TriggerSelector", "FrameStart"),
+        # a line that was turned over would light the bin between the exposures
+        Step("LineSelector", PROJECTOR_LINE, optional=True),
+        Step("LineMode", "Output", optional=True),
+        Step("LineInverter", False, optional=True),
         *_source(cameras, first),
         Step("TriggerMode", "On"),
     )

@@ -12,6 +12,7 @@ from binpick.camera.base import Clock
 from binpick.cell import machine, memory, store, worker
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
+from binpick.cell.meter import Meter
 from binpick.cell.worker import Cameras, Pose, Run, Worker
 from binpick.errors import CycleRefused, NotInControl
 from binpick.recording import Recorder
@@ -42,7 +43,8 @@ class Cell:
             max_age_ns=cell.result_max_age_ms * 1_000_000, memories=MappingProxyType(memories),
             faults=(trouble,) if trouble else ()), boot_id, cell.control)
         self._gallery = Gallery()
-        self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, pose, recorder, clock))
+        self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, pose, recorder, clock,
+                                           Meter(rig)))
         self._keeper = store.thread(kept, self._board) if kept is not None else None
         self._supervisor: asyncio.Task[None] | None = None
 

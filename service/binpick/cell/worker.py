@@ -13,6 +13,7 @@ from binpick.cell import memory as memories
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
 from binpick.cell.machine import State, Ticket
+from binpick.cell.meter import Meter
 from binpick.data import CameraStatus, Light, StereoPair
 from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout, PairRefused
 from binpick.recording import Recorder
@@ -67,6 +68,7 @@ class Worker:
     pose: Pose
     recorder: Recorder | None
     clock: Clock
+    meter: Meter
 
     def live(self) -> None:
         """The thread's body: opens cameras, waits for tickets, until the cell stops."""
@@ -158,16 +160,23 @@ class Worker:
 
     def _acquire(self, ticket: Ticket) -> CycleInput:
         """All shots of the recipe, one after the other; they are accepted together, after the last."""
-        pairs: list[StereoPair] = []
-        for light in ticket.job.recipe.lights:
-            self._proceed(ticket)
-            pairs.append(self.cameras.capture(light, ticket.deadline_ns))
-            if _triggered_ns(pairs[-1]) < ticket.started_ns:
-                raise PairRefused("the cameras gave a pair that is older than the trigger")
-        simulated = any(status.simulated for status in self.cameras.statuses())
+        statuses = self.cameras.statuses()
+        settled = self.meter.settle(ticket.job, ticket.request, statuses, lambda light: self._shoot(ticket, light))
+        pairs = [self._shoot(ticket, light) for light in settled.lights]
+        self.meter.watch(ticket.job, ticket.request, settled.lights, pairs)
+        simulated = any(status.simulated for status in statuses)
         self.board.step(machine.acquired, ticket.cycle_id)
         memory = memories.recall(self.board.state, ticket.job.bin.number)
-        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]), memory)
+        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]), memory,
+                          settled.outcome)
+
+    def _shoot(self, ticket: Ticket, light: Light) -> StereoPair:
+        """One accepted pair of this cycle."""
+        self._proceed(ticket)
+        pair = self.cameras.capture(light, ticket.deadline_ns)
+        if _triggered_ns(pair) < ticket.started_ns:
+            raise PairRefused("the cameras gave a pair that is older than the trigger")
+        return pair
 
     def _compute(self, ticket: Ticket, inputs: CycleInput) -> CycleResult:
         """The pipeline's result with the cell's own times; its arrays go to the gallery while the id still counts."""

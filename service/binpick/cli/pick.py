@@ -86,13 +86,13 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         typer.echo(f"{left.parent} is a recording: its cycle and request are used", err=True)
         recorded, _ = recording.load(left.parent)
         job = settings.resolve(cell, request.recipe or recorded.request.recipe, recorded.request.bin, recorded.request.tool)
-        if recorded.more or len(job.recipe.shots) > 1:
+        if recorded.more or recorded.job.recipe.metered or len(job.recipe.lights) > 1:
             job = _exposed(job, recorded.job.recipe)
         flange = request.T_base_flange or recorded.request.T_base_flange
         return replace(recorded, rig=rig, job=job, request=recorded.request.model_copy(update={"T_base_flange": flange}))
-    if len(job.recipe.shots) > 1:
-        typer.echo(f"two images are one shot: the other {len(job.recipe.shots) - 1} of the recipe are left out", err=True)
-        job = _exposed(job, job.recipe.model_copy(update={"shots": job.recipe.shots[:1]}))
+    if len(job.recipe.lights) > 1:
+        typer.echo(f"two images are one shot: the other {len(job.recipe.lights) - 1} of the recipe are left out", err=True)
+        job = _exposed(job, job.recipe.single)
     files = settings.FileCameras(backend="files", left=left, right=right)
     cameras = backends.group(files)
     deadline_ns = time.monotonic_ns() + 10_000_000_000
@@ -106,7 +106,7 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
 
 def _exposed(job: "Job", taken: "Recipe") -> "Job":
     """The job with the shots that the images really are: those of the recipe they were taken by."""
-    light = {name: getattr(taken, name) for name in ("exposure_us", "gain_db", "projector", "shots")}
+    light = {name: getattr(taken, name) for name in ("exposure_us", "auto", "gain_db", "projector", "hdr", "shots")}
     return job.model_copy(update={"recipe": job.recipe.model_copy(update=light)})
 
 

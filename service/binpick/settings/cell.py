@@ -177,8 +177,10 @@ class Cell(Strict):
             if recipe.mesh is not None and (strange := {grasp.tool for grasp in recipe.mesh.grasps} - own):
                 raise ValueError(f"recipe {recipe.number}: mesh.grasps are for tool {sorted(strange)}, the recipe's are "
                                  f"{sorted(own)}")
-            if len(recipe.shots) > 1 and self.cameras.backend == "files":
-                raise ValueError(f"recipe {recipe.number}: two images from disk are one shot, not {len(recipe.shots)}")
+            if len(recipe.lights) > 1 and self.cameras.backend == "files":
+                raise ValueError(f"recipe {recipe.number}: two images from disk are one shot, not {len(recipe.lights)}")
+            if recipe.metered and self.cameras.backend == "files":
+                raise ValueError(f"recipe {recipe.number}: exposure_us: auto needs cameras, not images from disk")
         if self.control == "modbus" and self.publish.modbus is None:
             raise ValueError("control is modbus, but publish.modbus is null")
         return self

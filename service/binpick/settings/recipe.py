@@ -1,5 +1,6 @@
 """A bin and a recipe: what stands where, and how a cycle looks for parts in it."""
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,6 +13,9 @@ from binpick.settings.mesh import Mesh
 from binpick.settings.stereo import PRESETS, Stereo
 
 Length = Annotated[float, Field(ge=0.02, le=3)]
+FIRST_TRY_US = 6000.0
+"""Where auto exposure begins."""
+SHORTEST_US = 20.0
 
 
 class Pose(Placement):
@@ -91,6 +95,22 @@ class Shot(Strict):
     The projector must step on at each strobe, in the recipe's order."""
 
 
+class AutoExposure(Strict):
+    """What `exposure_us: auto` goes by: exposure first; gain above the recipe's `gain_db` only beyond the longest exposure."""
+
+    target_grey: Annotated[float, Field(ge=20, le=230)] = 140.0
+    """What `percentile` is to be, grey levels of 255."""
+    percentile: Annotated[float, Field(ge=50, le=99.9)] = 95.0
+    """Share of the pixels of the bin's box that may not be brighter, %; of the camera that sees it brighter."""
+    longest_us: Annotated[float, Field(ge=100, le=500_000)] = 30_000.0
+    """Longest exposure, µs."""
+    highest_gain_db: Annotated[float, Field(ge=0, le=24)] = 6.0
+    """Highest gain, dB."""
+    drift: Annotated[float, Field(ge=0.1, le=1)] = 0.3
+    """A cycle whose images are brighter than those it was set by, or darker, by more than this share has the next one set it
+    again."""
+
+
 class SigmaLimits(Strict):
     """The most a grasp's own uncertainty may be, 1 sigma; a grasp beyond any of these is not published."""
 
@@ -155,12 +175,20 @@ class Recipe(Strict):
     """How disparity is found: `quality`, `fast`, or settings of your own."""
     segment: SegmentSettings = SegmentSettings()
     """Telling parts apart."""
-    exposure_us: Annotated[float, Field(ge=20, le=500_000)] = 6000.0
-    """Exposure time of both cameras, µs."""
+    exposure_us: Annotated[float, Field(ge=20, le=500_000)] | Literal["auto"] = 6000.0
+    """Exposure time of all cameras, µs. auto: test shots at the start of the first cycle find it, and again after the light has
+    changed; it is the same for all cameras and stays as it is during a cycle. Shots with the projector have one, those without
+    it another."""
+    auto: AutoExposure = AutoExposure()
+    """What `exposure_us: auto` goes by."""
     gain_db: Annotated[float, Field(ge=0, le=24)] = 0.0
-    """Gain of both cameras, dB."""
-    projector: bool = True
-    """Whether the pattern is on during exposure."""
+    """Gain of both cameras, dB; with `exposure_us: auto` the lowest."""
+    projector: bool | Literal["alternate"] = True
+    """Whether the pattern is on during exposure. alternate: in every shot, and one more is taken without it, which guides the
+    filter, is what people see, and takes out glare."""
+    hdr: Annotated[float, Field(ge=1.5, le=30)] | None = None
+    """Every shot is taken a second time with so many times shorter exposure, for parts of which some shine and some are dark;
+    null: not."""
     shots: Annotated[tuple[Shot, ...], Field(min_length=1, max_length=64)] = (Shot(),)
     """What a cycle exposes, one shot after the other; the first is the one shown."""
     limits: Limits = Limits()
@@ -191,11 +219,43 @@ class Recipe(Strict):
             raise ValueError(f"shots: the Gray code is the patterns {FIRST_GRAY_PATTERN} to {BLACK_PATTERN}, each once")
         return self
 
+    @model_validator(mode="after")
+    def _repeatable(self) -> "Recipe":
+        """A projector that steps on at each strobe cannot show a pattern for a test shot or a second exposure."""
+        asked = [name for name, wanted in (("exposure_us: auto", self.metered), ("hdr", self.hdr is not None)) if wanted]
+        if asked and any(shot.pattern for shot in self.shots):
+            raise ValueError(f"{' and '.join(asked)}: not with numbered patterns, of which each is shown once in a cycle")
+        if self.metered and any(shot.gain_db is not None and shot.exposure_us is None for shot in self.shots):
+            raise ValueError("shots: with exposure_us: auto a shot with its own gain_db needs its own exposure_us")
+        if self.metered and self.gain_db > self.auto.highest_gain_db:
+            raise ValueError(f"gain_db {self.gain_db:g} is above auto.highest_gain_db {self.auto.highest_gain_db:g}")
+        return self
+
+    @property
+    def metered(self) -> bool:
+        """Whether the cell finds exposure and gain by itself."""
+        return self.exposure_us == "auto"
+
     @property
     def lights(self) -> tuple[Light, ...]:
-        """What each shot is exposed with, in order."""
-        return tuple(
-            Light(exposure_us=self.exposure_us if shot.exposure_us is None else shot.exposure_us,
-                  gain_db=self.gain_db if shot.gain_db is None else shot.gain_db,
-                  projector=self.projector if shot.projector is None else shot.projector, pattern=shot.pattern)
-            for shot in self.shots)
+        """What each shot is exposed with, in order; metered ones as far as it is known before."""
+        lights = [self._light(shot) for shot in self.shots]
+        if self.projector == "alternate" and all(light.projector for light in lights):
+            lights.append(self._light(Shot(projector=False)))
+        if self.hdr is None:
+            return tuple(lights)
+        pairs = ((light, replace(light, exposure_us=max(light.exposure_us / self.hdr, SHORTEST_US))) for light in lights)
+        return tuple(light for pair in pairs for light in pair)
+
+    @property
+    def single(self) -> "Recipe":
+        """With the first shot alone."""
+        alone = {"shots": self.shots[:1], "hdr": None, "projector": bool(self.projector)}
+        return self.model_copy(update=alone)
+
+    def _light(self, shot: Shot) -> Light:
+        own = min(FIRST_TRY_US, self.auto.longest_us) if self.exposure_us == "auto" else self.exposure_us
+        return Light(exposure_us=own if shot.exposure_us is None else shot.exposure_us,
+                     gain_db=self.gain_db if shot.gain_db is None else shot.gain_db,
+                     projector=bool(self.projector) if shot.projector is None else shot.projector, pattern=shot.pattern,
+                     metered=self.metered and shot.exposure_us is None)

@@ -18,14 +18,13 @@ from binpick.camera.aravis.stream import Stream
 from binpick.camera.aravis.timekeeper import Timekeeper
 from binpick.camera.base import MonotonicNs
 from binpick.camera.clock import DeviceClock
+from binpick.camera.need import RANGES, Need
 from binpick.camera.proof import SYNCHRONISED
-from binpick.camera.sync import Step
+from binpick.camera.sync import PROJECTOR_LINE, Step
 from binpick.data import Frame, Light
-from binpick.errors import CameraHeld, CameraNotFound
+from binpick.errors import CameraError, CameraHeld, CameraNotFound
 from binpick.settings.cell import PixelFormat
 
-PROJECTOR_LINE = "Line2"
-"""The Alvium's opto-isolated output."""
 IDLE_NS = 5_000_000
 """So long nothing is asked of it before its clock is looked at: between the shots of one cycle a trigger would have to wait."""
 EXPOSURE_TOLERANCE = 0.01
@@ -35,12 +34,16 @@ GAIN_TOLERANCE_DB = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What a camera is set to when it is opened. `neighbours` are the other cameras' addresses, as far as they are known."""
+    """What a camera is set to when it is opened. `neighbours` are the other cameras' addresses, as far as they are known.
+
+    `needs` are what the recipes will set, of which nothing may lie outside of the camera's own ranges.
+    """
 
     steps: tuple[Step, ...]
     pixel_format: PixelFormat = "Mono8"
     packet_size: int | Literal["auto"] = "auto"
     neighbours: tuple[str, ...] = ()
+    needs: tuple[Need, ...] = ()
 
 
 class Driver:
@@ -93,9 +96,19 @@ class Driver:
             self._time = Timekeeper(camera, features)
             self._time.begin()
             self._note()
+            ranges = {name: features.bounds(feature) for name, feature in RANGES.items()}
+            self._meet(ranges)
             firmware = str(camera.get_string("DeviceFirmwareVersion")) if features.has("DeviceFirmwareVersion") else ""
             return {"model": str(camera.get_model_name()), "serial": found, "simulated": firmware.startswith("binpick-sim"),
-                    "packet_size": packet_size}
+                    "packet_size": packet_size, **ranges}
+
+    def _meet(self, ranges: dict[str, tuple[float, float]]) -> None:
+        """Raises CameraError for the first need that is out of range."""
+        for need in self._setup.needs:
+            low, high = ranges[need.range]
+            if not low <= need.value <= high:
+                raise CameraError(f"camera {self._name}: {need.setting} is {need.value:g}, but this camera's range is {low:g} "
+                                  f"to {high:g}: change the cell file", self._name)
 
     def _fit_packets(self, address: str) -> int:
         """Their size, and the pause between them when cameras share a port."""
@@ -133,14 +146,13 @@ class Driver:
     def configure(self, light: Light) -> None:
         """Writes what the light asks for. Raises CameraError when the camera makes something else of it."""
         assert self._stream is not None
-        camera = self._camera
         with self._translating("setting exposure and gain"):
             apart_us = light.exposure_us * EXPOSURE_TOLERANCE
             self._exposure_us = self._features.approach("ExposureTime", light.exposure_us, apart_us)
             self._gain_db = self._features.approach("Gain", light.gain_db, GAIN_TOLERANCE_DB)
             if self._features.has("LineSource"):
-                camera.set_string("LineSelector", PROJECTOR_LINE)
-                camera.set_string("LineSource", "ExposureActive" if light.projector else "Off")
+                self._features.apply((Step("LineSelector", PROJECTOR_LINE),
+                                      Step("LineSource", "ExposureActive" if light.projector else "Off")))
         self._stream.expect(self._exposure_us)
         self._idle_ns = time.monotonic_ns()
 

@@ -1,5 +1,6 @@
 """A camera's features through Aravis: written, read back, and compared; on the camera's own thread."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -8,6 +9,8 @@ from binpick.camera.sync import Step
 from binpick.errors import CameraError, CameraLost
 
 Value = str | int | float | bool
+ROUNDED = 1.001
+"""Increments that a rounded number may be off: one, as far as floats tell."""
 
 
 class Features:
@@ -34,12 +37,37 @@ class Features:
             if found != step.value:
                 raise self._unlike(step, found, refusal)
 
+    def bounds(self, feature: str) -> tuple[float, float]:
+        """The least and the most that the camera takes now. Raises CameraError, CameraLost."""
+        _, glib = library.load()
+        try:
+            low, high = self._camera.get_float_bounds(feature)
+        except glib.Error as error:
+            raise library.translated(error, self._name, f"reading the range of {feature}") from None
+        return float(low), float(high)
+
+    def _increment(self, feature: str) -> float:
+        """What it is rounded up to; 0 when the camera does not say. Raises CameraLost."""
+        _, glib = library.load()
+        try:
+            return float(self._camera.get_float_increment(feature))
+        except glib.Error as error:
+            trouble = library.translated(error, self._name, f"reading the increment of {feature}")
+            if isinstance(trouble, CameraLost):
+                raise trouble from None
+            return 0.0
+
     def approach(self, feature: str, wanted: float, tolerance: float) -> float:
-        """Sets a number that the camera may round; what it is now. Raises as `apply` does."""
+        """Sets a number that the camera may round, not clamp; what it is now. Raises as `apply` does."""
         step = Step(feature, float(wanted))
+        low, high = self.bounds(feature)
+        if not low <= wanted <= high:
+            raise CameraError(f"camera {self._name}: {feature} should be {wanted:g}, but this camera's range is {low:g} to "
+                              f"{high:g}: check the recipe", self._name)
         refusal = self._write(step)
         found = self._found(step)
-        if found is None or abs(float(found) - wanted) > tolerance:
+        off = abs(float(found) - wanted) if found is not None else math.inf
+        if found is None or (off > tolerance and off > ROUNDED * self._increment(feature)):
             raise self._unlike(step, found, refusal)
         return float(found)
 

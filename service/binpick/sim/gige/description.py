@@ -47,6 +47,8 @@ def _node(root: Xml.Element, feature: Feature, selected: list[str]) -> None:
         if feature.access != "RO":
             _leaf(node, "Min", feature.minimum)
             _leaf(node, "Max", feature.maximum)
+        if feature.increment:
+            _leaf(node, "Inc", feature.increment)
         if feature.unit:
             _leaf(node, "Unit", feature.unit)
     if feature.kind == "command":
@@ -71,7 +73,8 @@ def _register(root: Xml.Element, tag: str, name: str, feature: Feature) -> None:
     _leaf(node, "pPort", "Device")
     if feature.kind != "string":
         # what the camera changes by itself must not be read from a cache
-        _leaf(node, "Cachable", "WriteThrough" if feature.access == "RW" and not feature.bits else "NoCache")
+        settled = feature.access == "RW" and not feature.bits and not feature.increment
+        _leaf(node, "Cachable", "WriteThrough" if settled else "NoCache")
     if feature.bits and feature.bits[0] == feature.bits[1]:
         _leaf(node, "Bit", feature.bits[0])
     elif feature.bits:

@@ -28,7 +28,7 @@ Kind = Literal["integer", "float", "enumeration", "command", "string", "boolean"
 class Feature:
     """One row. `bits` (most, least significant; bit 0 is the highest) picks a field of a shared register; `selector` names
     the feature that indexes it, every `stride` bytes; `pins` are the indices that hold one value for good; `value` is the
-    power-up value, for a command the value that executes it."""
+    power-up value, for a command the value that executes it; a written float is rounded up to a multiple of its `increment`."""
 
     name: str
     category: str
@@ -47,6 +47,7 @@ class Feature:
     stride: int = 0
     pins: dict[int, int] = field(default_factory=dict)
     signed: bool = False
+    increment: float = 0.0
 
     @property
     def step(self) -> int:

@@ -4,6 +4,7 @@ Layout: GigE Vision 1.2, table of bootstrap registers.
 """
 
 import ipaddress
+import math
 import struct
 
 from binpick.sim.gige import description, features
@@ -70,6 +71,9 @@ class Registers:
             raise Fault(Status.WRITE_PROTECT if address + len(data) <= len(self._memory) else Status.INVALID_ADDRESS)
         if len(data) != feature.length or not _allowed(feature, data, index):
             raise Fault(Status.INVALID_PARAMETER)
+        if feature.increment:
+            steps = math.ceil(struct.unpack(">d", data)[0] / feature.increment - 1e-9)
+            data = struct.pack(">d", steps * feature.increment)
         if feature.kind != "command":
             self._memory[address:address + len(data)] = data
         return feature.name
