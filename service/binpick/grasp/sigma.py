@@ -17,11 +17,11 @@ from binpick.settings.tool import Cup
 
 Values = Float64[np.ndarray, "n"]
 
-CORRELATED_PX = 27.0
+CORRELATED_PX = 20.0
 """Half-resolution pixels that share one independent error of depth: blocks of the matcher, and what its smoothness adds."""
-SHARED = 0.26
+SHARED = 0.225
 """Of a pixel's sigma, what all of a surface has in common."""
-CURVED = 0.85
+CURVED = 0.74
 """The same on curved surfaces, which come out too far away (glossy ones the most)."""
 TILTED = 2.0
 """A plane over a disc tilts by twice its noise over the radius (exactly so for independent noise): over its points' spread."""
@@ -33,7 +33,7 @@ STEADY_M = 0.00006
 """Across the approach, what stays where nothing else errs: the pixels that a lip is centred by."""
 ASLANT = 0.4
 """What a wrong depth moves across the approach, as a share of it: the surface is looked at up to 30° aslant."""
-HELD = {"surface": 0.46, "angle_m": 0.003}
+HELD = {"surface": 0.35, "angle_m": 0.0023}
 """Two fingers, along the approach: of the part's mean sigma, and metres per radian of the ends' angle."""
 CLOSING = {"surface": 0.2, "angle_m": 0.0055, "border_m": 0.0002}
 """Two fingers, along the closing axis: also how far off the parts' borders are."""
