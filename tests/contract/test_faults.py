@@ -1,6 +1,7 @@
 """Every fault of the simulated cameras at every moment of a cell's life: the right end, and never a wrong image."""
 
 import contextlib
+import re
 import threading
 import time
 import zlib
@@ -51,6 +52,8 @@ CELL = settings.Cell.model_validate({
 HARMLESS = ("loss=0.05", "duplicate=0.3", "reorder=0.3", "late=0.05", "early_leader", "ptp=Listening")
 MAIMED = ("mute", "loss=1", "pixel_format=Mono12p", "mtu=800")
 GONE = ("unplug", "freeze", "power=off", "reboot=1", "stolen")
+LINE = (("line", "unplug@left"), ("line", "power=off@left"), ("line", "stolen@right"))
+"""The first camera triggers the second by a wire."""
 
 
 class Hooked(AravisCamera):
@@ -254,16 +257,15 @@ def test_a_camera_without_usable_images_is_refused_by_name_and_tried_again(stand
 
 
 @pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("fault", GONE)
+@pytest.mark.parametrize(("stand", "fault"), [*(("software", f"{fault}@right") for fault in GONE), *LINE], indirect=["stand"])
 def test_a_camera_that_is_gone_is_found_and_had_again(stand: Stand, fault: str, step: str) -> None:
-    result = stand.beset(step, stand.fault(f"{fault}@right"))
+    _, _, name = fault.partition("@")
+    result = stand.beset(step, stand.fault(fault))
     if result is None or result.return_code.code is GOOD:
         assert stand.wait(lambda: not stand.ready) < FOUND_S
     else:
-        assert "camera right" in result.return_code.message
-        assert "camera left" not in result.return_code.message
-    if not stand.ready:
-        assert all(reason.startswith("camera right") for reason in stand.reasons), stand.reasons
+        assert re.findall("camera (left|right)", result.return_code.message) == [name]
+    assert all(reason.startswith(f"camera {name}") for reason in stand.reasons), stand.reasons
     stand.clear()
     assert stand.wait(stand.good) < BACK_S
     assert stand.reasons == []
