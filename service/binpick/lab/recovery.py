@@ -83,17 +83,20 @@ def run(reconnects: int, tick: Callable[[float], None] = lambda _: None) -> dict
     plan = Plan(free(), SIZE)
     outages = [(fault, step, outage_s) for outage_s in OUTAGES_S for step in ("idle", "cycle") for fault in FAULTS]
     times: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    memory: list[tuple[float, float]] = []
     with Rig(plan) as rig, Cell(plan.addresses) as cell:
         _wait(cell.good)
         before = footprint.settled(2)
         for turn in range(reconnects):
             fault, step, outage_s = outages[turn % len(outages)]
             times.setdefault((fault, step), []).append(_suffer(rig, cell, fault, step, outage_s))
+            memory.append((turn / 100, footprint.now().memory_mb))
             if turn + 1 == min(WARM, reconnects):
                 before = footprint.settled(2)
             tick((turn + 1) / reconnects)
         after = footprint.settled(2)
-    return {"reconnects": reconnects, "before": before.row(), "after": after.row(), "faults": [
+    return {"reconnects": reconnects, "before": before.row(), "after": after.row(),
+            "memory_mb_per_100": footprint.growth_mb(memory), "faults": [
         {"fault": fault, "step": step, "times": len(found), **_medians(found)} for (fault, step), found in times.items()]}
 
 
@@ -133,9 +136,10 @@ def table(run: dict[str, Any]) -> Table:
     """Simulator figures, one row a fault; what 10 and all reconnects left behind below."""
     left = "; ".join(f"{when}: {', '.join(f'{value} {name}' for name, value in run[when].items())}"
                      for when in ("before", "after"))
+    grown = "" if run["memory_mb_per_100"] is None else f", {run['memory_mb_per_100']:+.2f} MB in 100 reconnects"
     sheet = Table("right camera", "the cell is", "times", "found s, median / max", "good pair after its return s, median / max",
                   title="Recovery on simulated cameras (simulator figures, not a camera's)",
-                  caption=f"{run['reconnects']} reconnects, {left}")
+                  caption=f"{run['reconnects']} reconnects, {left}{grown}")
     for row in run["faults"]:
         sheet.add_row(row["fault"], row["step"], str(row["times"]), f"{row['found_median_s']:.2f} / {row['found_max_s']:.2f}",
                       f"{row['back_median_s']:.2f} / {row['back_max_s']:.2f}")

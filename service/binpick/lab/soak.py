@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
 from binpick.camera import backends
@@ -22,14 +21,12 @@ from binpick.sim.gige.numbered import read
 LIGHT = Light(exposure_us=3000.0, gain_db=0.0, projector=True)
 PATIENCE_NS = 20_000_000_000
 PERIOD_S = 0.1
-WARM_SHARE = 0.2
-"""Of the run, before memory counts: pools fill in its beginning."""
 
 
 @dataclass
 class Log:
     """What happened. `offset` is how many more exposures the first camera made than the second, since power-up; `images` are
-    head, shot and checksum, one after the other."""
+    head, shot and checksum, one after the other; `memory` is in MB by minutes."""
 
     pairs: int = 0
     lost: int = 0
@@ -73,8 +70,8 @@ def run(seconds: float, size_px: tuple[int, int] = (1936, 1216),
     wrong = sum(sent[head][shot] != crc32 for head, shot, crc32 in zip(*[iter(log.images)] * 3, strict=True))
     return {"seconds": round(took_s, 1), "pairs": log.pairs, "rate_hz": round((log.pairs - 1) / took_s, 2), "lost": log.lost,
             "mispaired": log.mispaired, "stale": log.stale, "wrong_images": wrong, "late_starts": log.late,
-            "refused": group.statuses()[0].refused, "memory_mb_per_minute": _slope(log.memory), "before": before.row(),
-            "after": after.row()}
+            "refused": group.statuses()[0].refused, "memory_mb_per_minute": footprint.growth_mb(log.memory),
+            "before": before.row(), "after": after.row()}
 
 
 def _keep_pace(group: CameraGroup, log: Log, seconds: float, tick: Callable[[float], None]) -> None:
@@ -86,7 +83,7 @@ def _keep_pace(group: CameraGroup, log: Log, seconds: float, tick: Callable[[flo
         _capture(group, log)
         if turn % 10 == 0:
             elapsed = time.monotonic() - began
-            log.memory.append((elapsed, footprint.now().memory_mb))
+            log.memory.append((elapsed / 60, footprint.now().memory_mb))
             tick(min(1.0, elapsed / seconds))
 
 
@@ -99,12 +96,6 @@ def _capture(group: CameraGroup, log: Log) -> None:
         log.offset, log.newest = None, 0          # as the cell does
         return
     log.take(pair)
-
-
-def _slope(memory: list[tuple[float, float]]) -> float | None:
-    """MB a minute, by a straight line through all but the first fifth."""
-    kept = np.array(memory[int(len(memory) * WARM_SHARE):])
-    return round(float(np.polyfit(kept[:, 0] / 60, kept[:, 1], 1)[0]), 3) if len(kept) > 2 else None
 
 
 def table(row: dict[str, Any]) -> Table:
