@@ -1,10 +1,13 @@
 """The bench of reconnects and the long run, as short ones: their figures are of the packets that really went."""
 
 import io
+import json
+import sys
 
 import pytest
 from rich.console import Console
 
+from binpick import cli
 from binpick.lab import recovery, soak
 
 pytestmark = [pytest.mark.gige, pytest.mark.slow]
@@ -32,3 +35,13 @@ def test_a_long_run_reads_the_number_of_every_picture() -> None:
     sheet = io.StringIO()
     Console(file=sheet, width=150).print(soak.table(run))
     assert "mispaired" in sheet.getvalue()
+
+
+@pytest.mark.parametrize(("option", "value", "figure"), [("--reconnects", "1", "faults"), ("--soak", "1", "mispaired")])
+def test_both_are_options_of_the_cameras_bench(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], option: str,
+                                               value: str, figure: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["binpick", "bench", "cameras", option, value, "--json"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert not ended.value.code
+    assert figure in json.loads(capsys.readouterr().out)

@@ -203,6 +203,8 @@ def cameras(
     from binpick.errors import InputError
     from binpick.lab import cameras as lab
 
+    if reconnects and soak:
+        raise InputError("--reconnects and --soak are two runs: give one of them")
     if reconnects or soak:
         _endure(reconnects, soak, as_json)
         return
