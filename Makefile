@@ -45,7 +45,7 @@ fast:
 test: install-test lint  ## everything that CI runs
 	$(BIN)/pytest
 
-bench: $(STAMP)  ## accuracy and speed against the textbook pipeline, on the frozen exam
+bench: $(STAMP)  ## accuracy and speed on the frozen exam (ARGS="cameras --soak 600": pairs for 10 minutes; or --reconnects 200)
 	$(BIN)/binpick bench $(ARGS)
 
 fit: $(STAMP)  ## fit anew what counts as measured, on the exam's tuning seeds (stereo/weights.py)

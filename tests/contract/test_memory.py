@@ -95,6 +95,9 @@ class Showing:
     def close(self) -> None:
         self.opened = False
 
+    def watch(self) -> bool:
+        return False
+
     def statuses(self) -> tuple[CameraStatus, ...]:
         return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
 

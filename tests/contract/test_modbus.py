@@ -60,6 +60,9 @@ class GatedCameras:
     def close(self) -> None:
         self.opened = False
 
+    def watch(self) -> bool:
+        return False
+
     def statuses(self) -> tuple[CameraStatus, ...]:
         return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
 

@@ -59,6 +59,9 @@ class StagedCameras:
     def close(self) -> None:
         self.opened = False
 
+    def watch(self) -> bool:
+        return False
+
     def statuses(self) -> tuple[CameraStatus, ...]:
         return tuple(CameraStatus(name, self.opened, failures=int(self.broken), simulated=True,
                                   error="dead" if self.broken and name == "left" else "") for name in ("left", "right"))

@@ -44,6 +44,9 @@ class SlowCameras:
         """As the group's."""
         self._open = False
 
+    def watch(self) -> bool:
+        return False
+
     def statuses(self) -> tuple[CameraStatus, ...]:
         """As the group's."""
         return tuple(CameraStatus(name, self._open, simulated=True) for name in ("left", "right"))

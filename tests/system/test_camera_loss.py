@@ -298,6 +298,12 @@ def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: Gi
         cell.wait(cell.ready, "ready again")
         assert cell.health()["reasons"] == []
         assert cell.cycle().status_code == 200
+        gige.unplug(0)
+        assert cell.wait(lambda: not cell.ready(), "noticed though idle") < 1.5
+        assert camera_reasons(cell)[0].startswith("camera left is down: "), cell.health()
+        gige.plug(0)
+        assert cell.wait(cell.ready, "ready once more") < 5
+        assert cell.cycle().status_code == 200
         ends_well(cell)
 
 
@@ -406,7 +412,7 @@ def test_a_killed_daemons_cameras_are_taken_over_when_they_let_go(tmp_path: Path
         first.wait(first.ready, "ready")
         with started(first):
             os.killpg(first.process.pid, signal.SIGKILL)
-            killed = time.monotonic()
+            killed, gone = time.monotonic(), clock()
             first.process.wait()
     with daemon(tmp_path, gige, "rest", clock) as second:
         second.wait(lambda: len(camera_reasons(second)) == 2, "refused by both cameras")
@@ -414,6 +420,7 @@ def test_a_killed_daemons_cameras_are_taken_over_when_they_let_go(tmp_path: Path
         assert all("controlled by another program" in reason for reason in camera_reasons(second))
         second.wait(second.ready, "ready")
         assert time.monotonic() - killed > HELD_MS / 1000
+        assert clock() - gone < HELD_MS / 1000 + 5
         assert second.cycle().status_code == 200
         assert second.health()["reasons"] == []
         ends_well(second)

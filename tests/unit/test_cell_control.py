@@ -13,7 +13,7 @@ import pytest
 
 from binpick import health, pipeline, settings
 from binpick.camera.group import CameraGroup
-from binpick.cell import Cell
+from binpick.cell import Cell, worker
 from binpick.cell.worker import Pose as PoseStep
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import (
@@ -87,6 +87,9 @@ class TestCameras:
 
     def close(self) -> None:
         self.closed += 1
+
+    def watch(self) -> bool:
+        return False
 
     def statuses(self) -> tuple[CameraStatus, ...]:
         return tuple(CameraStatus(name, self.opened, simulated=True, error="dead" if self.broken == name else "")
@@ -415,6 +418,46 @@ def test_two_cameras_killed_in_mid_cycle_fail_it_within_two_seconds_by_name(fail
                 eye.fail = ""
             await until(cell, lambda s: s.phase == "ready", 15)
 
+    asyncio.run(scenario())
+
+
+def test_an_idle_cameras_death_and_return_need_no_trigger(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "BACKOFF_S", (60.0,))
+
+    async def scenario() -> None:
+        eyes = tuple(SimCamera(index, lambda *_: np.zeros((24, 32), np.uint8)) for index in (0, 1))
+        async with Cell(cell_settings(), rig(), CameraGroup(eyes, 5000.0), good, boot_id=7) as cell:
+            await until(cell, lambda s: s.phase == "ready")
+            eyes[1].fail = "dead"
+            shown = await until(cell, lambda s: s.phase == "starting")
+            assert health.judge(shown).reasons == ("camera right is down: the right camera does not answer",)
+            eyes[1].fail = ""
+            shown = await until(cell, lambda s: s.phase == "ready")      # though the next attempt is not due for a minute
+            assert health.judge(shown).reasons == ()
+
+    asyncio.run(scenario())
+
+
+def test_a_death_is_told_while_poses_are_computed() -> None:
+    told = threading.Event()
+
+    def pose(inputs: CycleInput, cycle: CycleResult, proceed: Callable[[], None]) -> CycleResult:
+        eyes[1].fail = "dead"
+        while not told.wait(0.01):
+            proceed()
+        return cycle
+
+    async def scenario() -> None:
+        async with Cell(cell_settings(), rig(), CameraGroup(eyes, 5000.0), good, boot_id=7, pose=pose) as cell:
+            await until(cell, lambda s: s.phase == "ready")
+            cell.start(Request(), "rest")
+            try:
+                shown = await until(cell, lambda s: s.valid and s.phase == "starting")
+            finally:
+                told.set()
+            assert [bool(camera.error) for camera in shown.cameras] == [False, True]
+
+    eyes = tuple(SimCamera(index, lambda *_: np.zeros((24, 32), np.uint8)) for index in (0, 1))
     asyncio.run(scenario())
 
 

@@ -52,6 +52,11 @@ class Camera(Protocol):
         """The whole frame of that trigger; older ones are dropped. Raises CameraLost, PairRefused (incomplete)."""
         ...
 
+    def watch(self) -> bool:
+        """An idle camera's well-being, without waiting; to be called several times a second. Raises CameraLost or CameraHeld
+        once an open one is known to be gone. True: a closed one that was away, or in other hands, can be had now."""
+        ...
+
     def close(self) -> None:
         """Give the camera back within 1 s, or abandon it; never raises."""
         ...

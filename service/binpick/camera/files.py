@@ -76,6 +76,10 @@ class FileCamera:
                      triggered_ns=triggered_ns, received_ns=self._clock(), exposure_us=self._light.exposure_us,
                      gain_db=self._light.gain_db)
 
+    def watch(self) -> bool:
+        """Nothing becomes of a file that was read."""
+        return False
+
     def close(self) -> None:
         """Forgets the image; the file is read again at the next opening."""
         self._image = None

@@ -87,6 +87,11 @@ class CameraGroup:
                     raise
                 log.info("shooting again: %s", refusal)
 
+    def watch(self) -> bool:
+        """Looks at idle cameras without waiting: one that is gone is closed, and named in a CameraError and in `statuses`.
+        True: `open` is worth a try at once, since one that was away can be had again."""
+        return any(self._each(lambda _, camera: camera.watch()))
+
     def _await_clocks(self, deadline_ns: MonotonicNs) -> None:
         until_ns = min(deadline_ns, self._clock() + PTP_NS)
         while why := self._starter.unready(self.statuses()):

@@ -1,5 +1,6 @@
 """The thread that owns the cameras and computes cycles; whatever happens in one, it is there for the next."""
 
+import contextlib
 import logging
 import threading
 import time
@@ -7,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-from binpick.camera.base import Clock, MonotonicNs
+from binpick.camera.base import Clock, MonotonicNs, remaining_s
 from binpick.cell import machine
 from binpick.cell import memory as memories
 from binpick.cell.board import Board
@@ -24,8 +25,8 @@ OPEN_LIMIT_S = 5.0
 """For one attempt to open all cameras: each needs about one second, a dead one two."""
 BACKOFF_S = (0.5, 1.0, 2.0, 5.0)
 """Waits between attempts to open the cameras."""
-WATCH_S = 0.5
-"""How often an idle cell looks at what its cameras say."""
+WATCH_S = 0.25
+"""How often an idle cell looks at its cameras."""
 INTERNAL_ERROR = "internal error, see the log"
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,11 @@ class Cameras(Protocol):
         """Triggers all and returns their accepted pair; raises CameraError."""
         ...
 
+    def watch(self) -> bool:
+        """Looks at idle cameras without waiting; raises a CameraError that names the ones that are gone. True: one that was
+        away can be opened again."""
+        ...
+
     def close(self) -> None:
         """Gives them back; never raises."""
         ...
@@ -50,6 +56,14 @@ class Cameras(Protocol):
     def statuses(self) -> tuple[CameraStatus, ...]:
         """What each says of itself, without waiting."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Attempts:
+    """At opening the cameras: how many failed in a row, and when the next is due."""
+
+    failed: int = 0
+    due_ns: MonotonicNs = 0
 
 
 Run = Callable[[CycleInput, Callable[[], None]], CycleResult]
@@ -72,7 +86,7 @@ class Worker:
 
     def live(self) -> None:
         """The thread's body: opens cameras, waits for tickets, until the cell stops."""
-        attempts = 0
+        attempts = Attempts()
         try:
             self.board.step(machine.observe, self.cameras.statuses())
             while not self.board.state.stopping:
@@ -80,28 +94,33 @@ class Worker:
         finally:
             self.cameras.close()
 
-    def _turn(self, attempts: int) -> int:
-        """One ticket, one attempt to open the cameras, or one look at them. Returns the failed attempts in a row."""
-        pause = WATCH_S if self.board.state.cameras_up else ((0.0, *BACKOFF_S)[min(attempts, len(BACKOFF_S))])
-        state = self.board.wait(_wanted, pause)
+    def _turn(self, attempts: Attempts) -> Attempts:
+        """One ticket, or one look at the cameras, which are opened when that is due or one of them came back."""
+        up, opening = self.board.state.cameras_up, False
+        state = self.board.wait(_wanted, WATCH_S if up else min(WATCH_S, remaining_s(attempts.due_ns, self.clock)))
         try:
             if state.stopping:
                 return attempts
             if state.ticket is not None:
                 self._cycle(state.ticket)
-            elif not state.cameras_up:
-                attempts += 1
+            elif self.cameras.watch() or (not state.cameras_up and self.clock() >= attempts.due_ns):
+                opening = True
                 self.cameras.open(self.clock() + int(OPEN_LIMIT_S * 1e9))
                 log.info("cameras open: %s", ", ".join(f"{c.name} {c.model} {c.serial}" for c in self.cameras.statuses()))
         except CameraError as error:
-            if attempts == 1 or _errors(self.cameras.statuses()) != _errors(state.cameras):     # not again at every attempt
+            if not attempts.failed or _errors(self.cameras.statuses()) != _errors(state.cameras):     # not at every attempt
                 log.warning("cameras not open: %s", error)
         except Exception:
             log.exception("unexpected, outside a cycle")
             self.board.step(machine.stumble, INTERNAL_ERROR)
             time.sleep(WATCH_S)
         self.board.step(machine.observe, self.cameras.statuses())
-        return 0 if self.board.state.cameras_up else attempts
+        if self.board.state.cameras_up:
+            return Attempts()
+        if not opening:
+            return attempts
+        pause_s = BACKOFF_S[min(attempts.failed, len(BACKOFF_S) - 1)]
+        return Attempts(attempts.failed + 1, self.clock() + int(pause_s * 1e9))
 
     def _cycle(self, ticket: Ticket) -> None:
         fault, inputs, cycle = "", None, None
@@ -157,6 +176,9 @@ class Worker:
         """Called between parts: whoever triggers or stops the cell does not wait for poses."""
         if _wanted(self.board.state):
             raise CycleAborted("the next cycle is wanted")
+        with contextlib.suppress(CameraError):      # its status says so
+            self.cameras.watch()
+        self.board.step(machine.observe, self.cameras.statuses())
 
     def _acquire(self, ticket: Ticket) -> CycleInput:
         """All shots of the recipe, one after the other; they are accepted together, after the last."""

@@ -188,6 +188,10 @@ def pose(
 def cameras(
     pairs: Annotated[int, typer.Option(help="Pairs in each series.", min=5, max=10000)] = 500,
     only: Annotated[str, typer.Option(help="Series whose name holds this, such as line, PTP, apart or lost.")] = "",
+    reconnects: Annotated[int, typer.Option(help="Instead so many outages of a camera: found when, and good again when.", min=0,
+                                            max=10000)] = 0,
+    soak: Annotated[float, typer.Option(metavar="SECONDS", help="Instead ten pairs a second for so long, each picture with its "
+                                        "number.", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """The pair on simulated GigE Vision cameras: reported against true skew, time to both images, lost packets."""
@@ -199,6 +203,12 @@ def cameras(
     from binpick.errors import InputError
     from binpick.lab import cameras as lab
 
+    if reconnects and soak:
+        raise InputError("--reconnects and --soak are two runs: give one of them")
+    if reconnects or soak:
+        _endure(reconnects, soak, as_json)
+        return
+
     chosen = [trial for trial in lab.programme(pairs) if only in trial.name]
     if not chosen:
         raise InputError(f"--only {only}: there are {', '.join(trial.name for trial in lab.programme(pairs))}")
@@ -208,3 +218,26 @@ def cameras(
         typer.echo(json.dumps(rows, indent=1))
     else:
         Console(width=190).print(lab.table(rows))
+
+
+def _endure(reconnects: int, soak: float, as_json: bool) -> None:
+    """Outages, or a long run."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from binpick.lab import recovery
+    from binpick.lab import soak as lab
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("Enduring", total=1.0)
+
+        def tick(share: float) -> None:
+            progress.update(task, completed=share)
+
+        run = recovery.run(reconnects, tick) if reconnects else lab.run(soak, tick=tick)
+    if as_json:
+        typer.echo(json.dumps(run, indent=1))
+    else:
+        Console(width=150).print(recovery.table(run) if reconnects else lab.table(run))

@@ -14,9 +14,10 @@ import numpy as np
 
 from binpick.data import Image, Light
 from binpick.errors import PortInUse
-from binpick.sim.gige import GigeGroup
+from binpick.sim.gige import GigeGroup, faults
 from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.gvcp import PORT
+from binpick.sim.gige.numbered import Numbered
 from binpick.sim.gige.ptp import Oscillator
 
 START_S = 30.0
@@ -33,13 +34,14 @@ class Exposure:
 @dataclass(frozen=True, slots=True)
 class Plan:
     """What is simulated. `apart`: each camera on a port of its own, where no PTP is heard; drift and offset are of the
-    second camera's clock against the host's."""
+    second camera's clock against the host's; `numbered`: pictures carry their number."""
 
     addresses: tuple[str, ...]
     size_px: tuple[int, int] = (1936, 1216)
     apart: bool = False
     offset_s: float = 0.78
     drift_ppm: float = 40.0
+    numbered: bool = False
 
 
 def free(cameras: int = 2) -> tuple[str, ...]:
@@ -90,6 +92,18 @@ class Rig:
         """That camera's images by frame id."""
         return {block: Exposure(started, crc) for block, started, crc in self._ask("truth", index)}
 
+    def sent(self, index: int) -> dict[int, int]:
+        """The checksums of that camera's images by their number since it got power."""
+        return {shot: crc for shot, _, crc in self._ask("sent", index)}
+
+    def fault(self, words: str) -> None:
+        """As `binpick sim --fault` has it."""
+        self._ask("fault", words)
+
+    def powered(self, index: int) -> bool:
+        """Whether that camera is on."""
+        return bool(self._ask("powered", index))
+
     def _ask(self, *what: Any) -> Any:
         self._pipe.send(what)
         return self._pipe.recv()
@@ -98,11 +112,12 @@ class Rig:
 def _serve(pipe: Connection, plan: Plan) -> None:
     width, height = plan.size_px
     scenes = [_scene(index, width, height) for index in range(len(plan.addresses))]
+    pictures = Numbered(len(plan.addresses), plan.size_px) if plan.numbered else None
 
     def image(index: int, _light: Light, shot: int) -> Image:
         return scenes[index] + np.uint8(shot & 0xFF)
 
-    with GigeGroup(image, plan.addresses, plan.size_px, apart=plan.apart) as group:
+    with GigeGroup(pictures or image, plan.addresses, plan.size_px, apart=plan.apart) as group:
         for index in range(1, len(plan.addresses)):
             group.ptp.tune(index, Oscillator(int(plan.offset_s * 1e9), int(plan.drift_ppm * 1000)), host_ns())
         pipe.send("up")
@@ -117,6 +132,12 @@ def _answer(group: GigeGroup, verb: str, *arguments: Any) -> Sequence[tuple[int,
             group.change(index, **changes)
         case "lose":
             group.drop_packets(*arguments)
+        case "fault":
+            faults.apply(group, faults.parse(*arguments))
+        case "powered":
+            return [(1, 0, 0)] if group.powered(*arguments) else []
+        case "sent":
+            return [(entry.shot, entry.block, entry.crc32) for entry in group.truth(*arguments) if entry.sent]
         case "truth":
             return [(entry.block, entry.started_ns, entry.crc32) for entry in group.truth(*arguments) if entry.sent]
     return []

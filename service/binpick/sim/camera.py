@@ -81,6 +81,12 @@ class SimCamera:
                      triggered_ns=started, received_ns=self._clock(), exposure_us=self._light.exposure_us,
                      gain_db=self._light.gain_db, acknowledged_ns=self._acknowledged_ns)
 
+    def watch(self) -> bool:
+        """Raises CameraLost when it is to fail, without being stuck; True: it failed, and is well again."""
+        if self._open:
+            self._obey(self._clock())
+        return not self._open and bool(self._error) and not self.fail
+
     def close(self) -> None:
         """Forgets the trigger."""
         self._open, self._triggered = False, None

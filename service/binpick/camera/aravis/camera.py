@@ -7,9 +7,10 @@ from typing import TypeVar
 from binpick.camera import probe
 from binpick.camera.aravis.driver import Driver, Setup
 from binpick.camera.base import MonotonicNs, remaining_s
+from binpick.camera.link import Link
 from binpick.camera.owner import Owner
 from binpick.data import CameraStatus, Frame, Light
-from binpick.errors import CameraError, CameraLost, CameraNotFound, PairRefused
+from binpick.errors import CameraError, CameraHeld, CameraLost, CameraNotFound, PairRefused
 
 T = TypeVar("T")
 HANDOVER_S = 1.5
@@ -32,6 +33,8 @@ class AravisCamera:
         self._driver: Driver | None = None
         self._owner: Owner | None = None
         self._retired: Owner | None = None
+        self._link: Link | None = None
+        self._away = False
 
     @property
     def name(self) -> str:
@@ -42,6 +45,7 @@ class AravisCamera:
         """Connects and starts the stream. Raises CameraNotFound, CameraHeld, CameraLost, CameraError."""
         self.close()
         if self._address and not probe.answers(self._address):
+            self._away = True
             raise self._fail(CameraNotFound(f"camera {self._name}: no camera answers at {self._address}: check power, cable "
                                             "and the address in the cell file", self._name))
         if self._retired is not None:      # may still hold the camera; when that lives, it lets go soon
@@ -52,6 +56,10 @@ class AravisCamera:
         address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
         facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
         self._status = replace(self._status, connected=True, error="", address=address, **facts)
+        self._away = False
+        if self._link is None:
+            self._link = Link(address)
+        self._link.forget()
 
     def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
         """Exposure, gain, and whether the line that strobes the projector does so."""
@@ -85,6 +93,27 @@ class AravisCamera:
         self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends)
         return frame
 
+    def watch(self) -> bool:
+        """By what it says to a socket of our own, and to its own thread's looks at its clock."""
+        if self._link is None:
+            if not self._status.address:
+                return False
+            self._link = Link(self._status.address)
+        state, driver = self._link.feel(), self._driver
+        if driver is None:
+            back = self._away and state == "free"
+            self._away = self._away and not back
+            return back
+        if driver.trouble is not None:
+            raise self._fail(driver.trouble)
+        if state == "silent":
+            raise self._fail(CameraLost(f"camera {self._name} does not answer any more: check its power, cable and network",
+                                        self._name))
+        if state == "free":
+            raise self._fail(CameraLost(f"camera {self._name} obeys nobody any more: it was without power or network for a "
+                                        "moment", self._name))
+        return False
+
     def close(self) -> None:
         """Gives the camera back; at most 0.9 s, and 0.05 s for one that failed, since that may take its thread long."""
         if self._owner is not None:
@@ -93,6 +122,9 @@ class AravisCamera:
         elif self._retired is not None:
             self._retired.join(0.05)
         self._owner = self._driver = None
+        if self._link is not None:
+            self._link.close()
+            self._link = None
         self._status = replace(self._status, connected=False)
 
     def status(self) -> CameraStatus:
@@ -127,5 +159,6 @@ class AravisCamera:
         if self._owner is not None:
             self._owner.retire()
             self._retired, self._owner, self._driver = self._owner, None, None
+        self._away = self._away or isinstance(error, CameraLost | CameraHeld)
         self._status = replace(self._status, connected=False, error=str(error), failures=self._status.failures + 1)
         return error

@@ -22,7 +22,7 @@ from binpick.camera.need import RANGES, Need
 from binpick.camera.proof import SYNCHRONISED
 from binpick.camera.sync import PROJECTOR_LINE, Step
 from binpick.data import Frame, Light
-from binpick.errors import CameraError, CameraHeld, CameraNotFound
+from binpick.errors import CameraError, CameraHeld, CameraLost, CameraNotFound
 from binpick.settings.cell import PixelFormat
 
 IDLE_NS = 5_000_000
@@ -49,7 +49,8 @@ class Setup:
 class Driver:
     """Aravis' objects and what is done to them; lives on the camera's thread.
 
-    Other threads may read `clock`, the device's as latched, and `ptp`, its state and its offset from the master in ns.
+    Other threads may read `clock`, the device's as latched, `ptp`, its state and its offset from the master in ns, and
+    `trouble`, why it could not be talked to in an idle moment.
     """
 
     def __init__(self, name: str, setup: Setup) -> None:
@@ -64,6 +65,7 @@ class Driver:
         self._waiting, self._idle_ns = False, 0
         self.clock = DeviceClock()
         self.ptp = ("", 0.0)
+        self.trouble: CameraError | None = None
 
     def find(self, serial: str) -> str:
         """The address of the camera with that serial number, by broadcast (1 s). Raises CameraNotFound."""
@@ -139,8 +141,13 @@ class Driver:
     def rest(self) -> None:
         """Looks at its clock."""
         if self._time is not None:
-            with self._translating("reading its clock"):
-                self._time.rest()
+            try:
+                with self._translating("reading its clock"):
+                    self._time.rest()
+            except (CameraLost, CameraHeld) as error:
+                # the error itself has a traceback, whose frames would keep the camera's objects
+                self.trouble = type(error)(str(error), error.camera)
+                raise
             self._note()
 
     def configure(self, light: Light) -> None:

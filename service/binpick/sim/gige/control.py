@@ -10,6 +10,8 @@ from binpick.sim.gige.gvcp import Code, Command, Fault, Status, acknowledge, par
 from binpick.sim.gige.registers import Registers
 
 Peer = tuple[str, int]
+HARMLESS = (Code.DISCOVERY, Code.READREG, Code.READMEM)
+"""Carried out as often as they come."""
 
 
 class Control:
@@ -48,7 +50,7 @@ class Control:
         if self._last[:2] == (datagram, peer):
             return self._last[2]
         reply = self._carry_out(command, peer, arrived_ns)
-        if reply is not None:
+        if reply is not None and command.code not in HARMLESS:
             self._last = datagram, peer, reply
         return reply
 

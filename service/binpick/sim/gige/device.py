@@ -78,6 +78,7 @@ class Device:
         """These hold from now on."""
         before, self.conditions = self.conditions, conditions
         self.stream.sender.mtu = conditions.mtu
+        self.stream.sender.silent = not (conditions.plugged and conditions.answers and conditions.sends)
         if (before.transit, before.seed) != (conditions.transit, conditions.seed):     # else chance goes on as it was
             self.stream.sender.disturb(conditions.transit, conditions.seed + self.identity.index)
 

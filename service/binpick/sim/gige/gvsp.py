@@ -78,7 +78,8 @@ def _header(block: int, kind: int, packet: int) -> bytes:
 class Sender:
     """The stream channel's socket. `send` is for one thread, `resend` for another.
 
-    `gap_ns` is waited between packets beyond what the link takes; payload packets larger than `mtu` do not get through.
+    `gap_ns` is waited between packets beyond what the link takes; payload packets larger than `mtu` do not get through; none
+    do while it is `silent`.
     """
 
     def __init__(self, address: str, bits_per_s: float) -> None:
@@ -90,6 +91,7 @@ class Sender:
         self._transit = Transit()
         self._random = np.random.default_rng(0)
         self.resent = 0
+        self.silent = False
 
     @property
     def port(self) -> int:
@@ -151,6 +153,8 @@ class Sender:
                     time.sleep(ahead)
 
     def _burst(self, block: Block, packets: Indices, target: Target) -> None:
+        if self.silent:                # since a moment ago, in the midst of an image
+            return
         if 0 < packets[0] <= len(block.rows):
             self._socket.sendto(block.rows[packets - 1].data, target)
             return
