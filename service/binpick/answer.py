@@ -3,6 +3,7 @@
 from dataclasses import asdict
 
 from binpick import geometry
+from binpick.cycle import CycleInput
 from binpick.data import Grasp, Light, PartPose, StereoPair
 from binpick.errors import Code
 from binpick.frames import Frames
@@ -17,17 +18,7 @@ from binpick.message import (
     ShotMessage,
     SyncMessage,
 )
-from binpick.result import (
-    CycleInput,
-    Funnel,
-    GraspMessage,
-    Inputs,
-    PartMessage,
-    Result,
-    ReturnCode,
-    Sigma,
-    ToolMessage,
-)
+from binpick.result import Funnel, GraspMessage, Inputs, PartMessage, Result, ReturnCode, Sigma, ToolMessage
 from binpick.scene import bin as load_carrier
 from binpick.scene.location import Location
 from binpick.settings import Job

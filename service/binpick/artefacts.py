@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from binpick import geometry
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Image, OrganisedCloud, Rectified
 from binpick.geometry import Points, Transform
 from binpick.message import PoseMessage, Triple
-from binpick.result import CycleInput, CycleResult, GraspMessage, ReturnCode
+from binpick.result import GraspMessage, ReturnCode
 from binpick.settings import SuctionTool, Tool
 
 Picture = UInt8[np.ndarray, "h w 3"]

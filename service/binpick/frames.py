@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from binpick.cycle import CycleInput
 from binpick.errors import FrameUnavailable
 from binpick.geometry import Transform
-from binpick.result import CycleInput, FrameName
+from binpick.result import FrameName
 from binpick.scene import bin as load_carrier
 from binpick.scene.location import Location
 

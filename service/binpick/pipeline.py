@@ -12,6 +12,7 @@ from jaxtyping import Float32
 
 from binpick import geometry
 from binpick.answer import answer, code_of, part_messages, publishable
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Depth, Grasp, HeightMap, Image, Light, OrganisedCloud, PartPose, Rectified, Segments
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable
 from binpick.frames import Frames
@@ -31,7 +32,7 @@ from binpick.grasp import (
     verification,
     wrist,
 )
-from binpick.result import CycleInput, CycleResult, Request
+from binpick.result import Request
 from binpick.rig import Rig
 from binpick.scene import bin as load_carrier
 from binpick.scene import heightmap

@@ -23,11 +23,12 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from binpick import __version__, rig
+from binpick.cycle import CycleInput
 from binpick.data import Frame, Image, StereoPair, frozen
 from binpick.errors import ImageError, InputError
 from binpick.message import Metering, Wire
 from binpick.outcomes import NO_MEMORY, Memory
-from binpick.result import CycleInput, Request, Result
+from binpick.result import Request, Result
 from binpick.settings import Job
 
 QUEUE = 2

@@ -3,21 +3,15 @@
 A `Result` is serialised once to bytes; REST sends those, the registers are filled from the same object. Metres, radians.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
-from binpick import geometry
-from binpick.data import CameraStatus, Depth, Image, Light, OrganisedCloud, Rectified, Segments, StereoPair
+from binpick.data import CameraStatus
 from binpick.errors import Code
-from binpick.geometry import Transform
-from binpick.message import BinMessage, Metering, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
-from binpick.outcomes import NO_MEMORY, Attempt, Memory
-from binpick.rig import Rig
-from binpick.settings import Job
+from binpick.message import BinMessage, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
+from binpick.outcomes import Attempt
 
 FrameName = Literal["camera", "bin", "base"]
 Phase = Literal["starting", "ready", "acquiring", "computing", "stopping"]
@@ -193,75 +187,6 @@ def failure(cycle_id: int, request: Request, code: Code, message: str = "", *, s
     """The result of a cycle that never came to its scene."""
     return Result(cycle_id=cycle_id, request=request, captured_at=None, simulated=simulated,
                   return_code=ReturnCode.of(code, message), bin=None)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CycleInput:
-    """Everything that one cycle reads; stored together with its result it is a recording.
-
-    `pair` is the recipe's first shot, `more` are the others; `metering` says what auto exposure came to.
-    """
-
-    cycle_id: int
-    pair: StereoPair
-    rig: Rig
-    job: Job
-    request: Request
-    simulated: bool = False
-    more: tuple[StereoPair, ...] = ()
-    memory: Memory = NO_MEMORY
-    """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
-    metering: Metering = ""
-
-    @property
-    def lights(self) -> tuple[Light, ...]:
-        """As the recipe says; metered ones as the left camera was set."""
-        return tuple(replace(light, exposure_us=pair.left.exposure_us, gain_db=pair.left.gain_db) if light.metered else light
-                     for light, pair in zip(self.job.recipe.lights, self.pairs, strict=True))
-
-    @property
-    def pairs(self) -> tuple[StereoPair, ...]:
-        """All shots in order."""
-        return (self.pair, *self.more)
-
-    @property
-    def T_base_camera(self) -> Transform | None:
-        """Maps camera coordinates to the robot's base: a fixed rig's own, or through the request's flange; else None."""
-        if self.rig.T_base_rig is not None:
-            return np.array(self.rig.T_base_rig)
-        flange = self.request.T_base_flange
-        if self.rig.T_flange_rig is None or flange is None:
-            return None
-        T_base_flange = geometry.from_quaternion(np.array(flange.position_m), np.array(flange.quaternion_xyzw))
-        return np.asarray(T_base_flange @ np.array(self.rig.T_flange_rig))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CycleResult:
-    """The answer, and what people want to see of how it came about (None from the stage on that was not reached)."""
-
-    result: Result
-    rectified: Rectified | None = None
-    depth: Depth | None = None
-    reprojected: Callable[[], OrganisedCloud] | None = None
-    """Makes the cloud: no cycle waits for what only people look at."""
-    segments: Segments | None = None
-    verified: tuple[Attempt, ...] = ()
-    """What became of grasps of the last cycle that nobody spoke of, as far as heights tell."""
-    memory: Memory | None = None
-    """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
-    T_camera_bin: Transform | None = None
-    shown: Image | None = None      # the window of the left view without the pattern, where a shot was taken so
-
-    @property
-    def cloud(self) -> OrganisedCloud | None:
-        """The organised cloud, made anew each time that somebody asks."""
-        return None if self.reprojected is None else self.reprojected()
-
-    @property
-    def attempts(self) -> tuple[Attempt, ...]:
-        """The published grasps, as they are remembered once their outcomes are told."""
-        return self.memory.look.attempts if self.memory is not None and self.memory.look is not None else ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,14 @@ from binpick.camera.starter import Starter
 from binpick.cell import machine, worker
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
+from binpick.cell.meter import Meter
 from binpick.cell.worker import Worker
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Image, Light
 from binpick.errors import CameraHeld, Code
 from binpick.lab import footprint
 from binpick.lab.rig import free
-from binpick.result import CycleInput, CycleResult, Request, Result, ReturnCode
+from binpick.result import Request, Result, ReturnCode
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.settings.cell import AravisCameras, CameraAddress, Sync
@@ -86,7 +88,7 @@ class Stand:
         self._last = self.cameras[0 if mode == "line" else 1]
         self.group = CameraGroup(self.cameras, MAX_SKEW_US, starter=Starter(mode, sync.device_key(wanted)))
         self.thread = worker.thread(Worker(self.board, Gallery(), self.group, RIG, self._run, lambda _, cycle, __: cycle, None,
-                                           time.monotonic_ns))
+                                           time.monotonic_ns, Meter(RIG)))
 
     def __enter__(self) -> "Stand":
         self.gige.start()

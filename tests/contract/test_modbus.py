@@ -16,20 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from binpick import settings
 from binpick.cell import Cell
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import Code, NotReady, PortInUse
 from binpick.publish.modbus import ModbusServer
-from binpick.result import (
-    BinMessage,
-    CycleInput,
-    CycleResult,
-    GraspMessage,
-    PoseMessage,
-    Result,
-    ReturnCode,
-    Sigma,
-    ToolMessage,
-)
+from binpick.result import BinMessage, GraspMessage, PoseMessage, Result, ReturnCode, Sigma, ToolMessage
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.settings.cell import ModbusSettings

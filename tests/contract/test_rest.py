@@ -22,10 +22,11 @@ from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from binpick import health, settings
 from binpick.cell import Cell
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import CameraLost, Code
 from binpick.publish import rest
-from binpick.result import CycleInput, CycleResult, GraspMessage, PoseMessage, Result, ReturnCode, Sigma, ToolMessage
+from binpick.result import GraspMessage, PoseMessage, Result, ReturnCode, Sigma, ToolMessage
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from binpick import geometry, settings
+from binpick.cycle import CycleInput
 from binpick.data import Depth, Frame, Rectified, StereoPair, Window
 from binpick.geometry import Transform
-from binpick.result import CycleInput, Request
+from binpick.result import Request
 from binpick.rig import Rig
 from binpick.sim import exam
 from binpick.sim.render import Renderer

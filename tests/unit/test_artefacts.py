@@ -7,22 +7,11 @@ import numpy as np
 import pytest
 
 from binpick import artefacts, geometry
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Depth, Frame, OrganisedCloud, Rectified, Segments, StereoPair, Window, frozen
 from binpick.errors import Code
 from binpick.geometry import Transform
-from binpick.result import (
-    BinMessage,
-    CycleInput,
-    CycleResult,
-    FrameName,
-    GraspMessage,
-    PoseMessage,
-    Request,
-    Result,
-    ReturnCode,
-    Sigma,
-    ToolMessage,
-)
+from binpick.result import BinMessage, FrameName, GraspMessage, PoseMessage, Request, Result, ReturnCode, Sigma, ToolMessage
 from binpick.rig import Rig
 from binpick.settings import Bin, Job, Pose, Recipe, SuctionTool, TwoFingerTool
 

@@ -15,6 +15,7 @@ from binpick import health, pipeline, settings
 from binpick.camera.group import CameraGroup
 from binpick.cell import Cell, worker
 from binpick.cell.worker import Pose as PoseStep
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import (
     Busy,
@@ -27,7 +28,7 @@ from binpick.errors import (
     NotReady,
     UnknownItem,
 )
-from binpick.result import CycleInput, CycleResult, PartMessage, Request, Result, ReturnCode, Snapshot
+from binpick.result import PartMessage, Request, Result, ReturnCode, Snapshot
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.sim.camera import SimCamera

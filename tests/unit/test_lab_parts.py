@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from binpick import geometry, settings
+from binpick.cycle import CycleInput
 from binpick.data import Frame, StereoPair, Window
 from binpick.lab import parts
 from binpick.lab.exam import Paper
 from binpick.lab.parts import PartScore
-from binpick.result import CycleInput, Request
+from binpick.result import Request
 from binpick.sim import exam
 from binpick.sim.world import ScenePart, WorldScene
 

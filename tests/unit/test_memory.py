@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from binpick import geometry, pipeline, recording, settings
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Grasp, HeightMap, frozen
 from binpick.errors import Code
 from binpick.grasp import memory as laws
 from binpick.outcomes import COLLISION, DOUBLE, DROPPED, MISSED, OK, SKIPPED, UNREACHABLE, Attempt, Grid, Look, Memory
-from binpick.result import CycleInput, CycleResult, Result
+from binpick.result import Result
 
 LATER = "2026-01-01T00:10:00Z"
 SEED = 3

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from binpick import answer, geometry, pipeline, recording
+from binpick.cycle import CycleInput
 from binpick.data import Grasp, Light, StereoPair
 from binpick.errors import Code, FlangePoseMissing, FrameUnavailable, ImageError
 from binpick.frames import Frames
 from binpick.lab import exam
-from binpick.result import CycleInput, PoseMessage, Request
+from binpick.result import PoseMessage, Request
 from binpick.settings import SuctionTool, TwoFingerTool
 from binpick.settings.recipe import Shot
 from binpick.sim import score

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from binpick import pipeline, recording, settings
+from binpick.cycle import CycleInput
 from binpick.data import Frame, StereoPair, frozen
 from binpick.errors import Code, ImageError, InputError, RigError
 from binpick.outcomes import Attempt, Grid, Look, Memory
 from binpick.recording import Recorder
-from binpick.result import CycleInput, Request, failure
+from binpick.result import Request, failure
 from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.settings.recipe import Shot

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from binpick import geometry, settings
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Frame, StereoPair
 from binpick.errors import Code
 from binpick.grasp import sigma
 from binpick.lab import exam, offsets
-from binpick.result import CycleInput, CycleResult, GraspMessage, PoseMessage, Request, Sigma, ToolMessage, failure
+from binpick.result import GraspMessage, PoseMessage, Request, Sigma, ToolMessage, failure
 from binpick.settings import Cup
 from binpick.sim import exam as frozen
 from binpick.sim import score

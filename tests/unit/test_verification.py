@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from binpick import geometry, pipeline
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import HeightMap, frozen
 from binpick.errors import Code
 from binpick.grasp import memory as laws
 from binpick.grasp.verification import verified
 from binpick.outcomes import DOUBLE, MISSED, OK, Attempt, Grid, Look, Memory
-from binpick.result import CycleInput, CycleResult
 from binpick.settings.stereo import PRESETS
 
 NO_CHANGE: Callable[[np.ndarray], None] = lambda grid: None  # noqa: E731

@@ -4,12 +4,11 @@ import socket
 import struct
 from ipaddress import IPv4Address
 
+from binpick.camera.link import PRIVILEGE, READ, READREG, READREG_ACK
 from binpick.camera.probe import PORT, TRIES, TRY_S
 
-READREG = struct.Struct(">BBHHHI")
-"""Key 0x42, acknowledge wanted, READREG_CMD 0x0080, 4 bytes, request number, register (GigE Vision 1.2)."""
-READREG_ACK = struct.Struct(">HHHHI")
-CONTROL_PRIVILEGE = 0xA00
+VALUE = struct.Struct(">HHHHI")
+"""A reply with its one register."""
 CONTROLLED = 0b11
 """Exclusive access, and control access."""
 CONTROLLER_ADDRESS = 0xA14
@@ -18,7 +17,7 @@ CONTROLLER_ADDRESS = 0xA14
 
 def of(address: str) -> str | None:
     """"" when it is free, the controller's IPv4 address or "another program" when it is not, None: it does not answer."""
-    privilege = _register(address, CONTROL_PRIVILEGE, 1)
+    privilege = _register(address, PRIVILEGE, 1)
     if privilege is None:
         return None
     if not privilege & CONTROLLED:
@@ -40,11 +39,11 @@ def _register(address: str, register: int, request: int) -> int | None:
 
 def _asked(asking: socket.socket, register: int, request: int) -> int | None:
     try:
-        asking.send(READREG.pack(0x42, 1, 0x80, 4, request, register))
+        asking.send(READ.pack(0x42, 1, READREG, 4, request, register))
         answer = asking.recv(64)
     except TimeoutError:
         return None
-    if len(answer) != READREG_ACK.size:      # a refusal carries no value
+    if len(answer) != VALUE.size:      # a refusal carries no value
         return None
-    status, code, _length, of_request, value = READREG_ACK.unpack(answer)
-    return value if (status, code, of_request) == (0, 0x81, request) else None
+    status, code, _length, of_request, value = VALUE.unpack(answer)
+    return value if (status, code, of_request) == (0, READREG_ACK, request) else None

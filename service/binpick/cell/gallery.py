@@ -3,7 +3,8 @@
 import threading
 
 from binpick import artefacts
-from binpick.result import Artefact, CycleInput, CycleResult
+from binpick.cycle import CycleInput, CycleResult
+from binpick.result import Artefact
 
 
 class Exhibit:

@@ -10,11 +10,12 @@ import numpy as np
 from binpick import geometry
 from binpick.camera import exposure
 from binpick.camera.exposure import Limits, Search
+from binpick.cycle import CycleInput
 from binpick.data import CameraStatus, Light, StereoPair
 from binpick.frames import Frames
 from binpick.geometry import Transform
 from binpick.message import Metering
-from binpick.result import CycleInput, Request
+from binpick.result import Request
 from binpick.rig import Rig, RigCamera
 from binpick.settings import Job
 from binpick.settings.recipe import SHORTEST_US

@@ -15,10 +15,11 @@ from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
 from binpick.cell.machine import State, Ticket
 from binpick.cell.meter import Meter
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import CameraStatus, Light, StereoPair
 from binpick.errors import BinpickError, CameraError, Code, CycleAborted, CycleTimeout, PairRefused
 from binpick.recording import Recorder
-from binpick.result import CycleInput, CycleResult, Published, Result, failure
+from binpick.result import Published, Result, failure
 from binpick.rig import Rig
 
 OPEN_LIMIT_S = 5.0

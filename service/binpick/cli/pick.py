@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from binpick.cycle import CycleInput, CycleResult
     from binpick.message import PoseMessage
-    from binpick.result import CycleInput, CycleResult, Request
+    from binpick.result import Request
     from binpick.rig import Rig
     from binpick.settings import Cell, Job, Recipe
 
@@ -79,7 +80,7 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
 
     from binpick import recording, settings
     from binpick.camera import backends
-    from binpick.result import CycleInput
+    from binpick.cycle import CycleInput
 
     job = settings.resolve(cell, request.recipe)
     if (left.parent / "input.json").is_file() and (left.name, right) == ("left.png", left.parent / "right.png"):

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16
 
 from binpick import geometry
+from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Grasp, HeightMap, Segments
 from binpick.geometry import Transform
 from binpick.message import Triple
 from binpick.outcomes import COLLISION, DOUBLE, DROPPED, MISSED, OK, UNREACHABLE, Attempt, Grid, Look, Memory
-from binpick.result import CycleInput, CycleResult, GraspMessage
+from binpick.result import GraspMessage
 
 FAILURES = (MISSED, DROPPED, COLLISION, DOUBLE)
 """What speaks against a part's hold. Skipped says nothing; unreachable speaks of a pose, not of a hold."""

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from binpick import pipeline, settings
+from binpick.cycle import CycleInput, CycleResult
 from binpick.grasp import memory
 from binpick.lab import exam, grasps
 from binpick.lab.archive import NOWHERE, Archive
 from binpick.lab.exam import Paper
 from binpick.outcomes import COLLISION, MISSED, NO_MEMORY, OK, Memory
-from binpick.result import CycleInput, CycleResult, Request, Result
+from binpick.result import Request, Result
 from binpick.sim import exam as frozen
 from binpick.sim import lift, oracle, score
 from binpick.sim.score import Verdict

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from scipy.stats import binomtest
 
 from binpick import settings
+from binpick.cycle import CycleInput
 from binpick.data import Frame, Image, Light, StereoPair, Window
 from binpick.lab.archive import NOWHERE, Archive
-from binpick.result import CycleInput, Request
+from binpick.result import Request
 from binpick.settings import Recipe, SegmentSettings
 from binpick.settings.recipe import Shot
 from binpick.sim import exam

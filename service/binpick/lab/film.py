@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from binpick import artefacts
+from binpick.cycle import CycleInput, CycleResult
 from binpick.errors import InputError
 from binpick.lab import clearing
 from binpick.lab.archive import NOWHERE, Archive
 from binpick.lab.clearing import TASKS
-from binpick.result import CycleInput, CycleResult
 from binpick.sim.world import World
 
 WIDTH_PX = 640

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from binpick import geometry, pipeline
+from binpick.cycle import CycleResult
 from binpick.data import Window
 from binpick.geometry import Transform
 from binpick.lab import baseline, exam, stereo
 from binpick.lab.exam import Paper
 from binpick.lab.stereo import DepthScore
-from binpick.result import CycleResult, GraspMessage
+from binpick.result import GraspMessage
 from binpick.sim import score
 from binpick.sim.score import Verdict
 

@@ -8,10 +8,11 @@ from jaxtyping import Float32, Float64
 from rich.table import Table
 
 from binpick import geometry
+from binpick.cycle import CycleResult
 from binpick.geometry import Transform, Vector
 from binpick.lab import grasps
 from binpick.lab.exam import Paper
-from binpick.result import CycleResult, GraspMessage
+from binpick.result import GraspMessage
 from binpick.settings import Cup, SuctionTool
 from binpick.sim import pinch
 from binpick.sim.mesh import Caster

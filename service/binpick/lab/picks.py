@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from binpick import pipeline
+from binpick.cycle import CycleResult
 from binpick.lab import exam, grasps, offsets, parts
 from binpick.lab.archive import NOWHERE, Archive
 from binpick.lab.exam import Paper
 from binpick.lab.parts import PartScore
-from binpick.result import CycleResult
 
 KINDS = {"suction": ("block", "mixed", "bracket"), "two_finger": ("cylinder", "tee", "mixed")}
 """What each tool is tried on: parts that it is made for, and all together."""

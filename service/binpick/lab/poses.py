@@ -13,12 +13,13 @@ from jaxtyping import Float64
 from rich.table import Table
 
 from binpick import geometry, pipeline
+from binpick.cycle import CycleInput, CycleResult
 from binpick.geometry import Transform
 from binpick.grasp import shape
 from binpick.grasp.shape import Shape
 from binpick.lab import exam, parts
 from binpick.lab.exam import Paper
-from binpick.result import CycleInput, CycleResult, PartMessage
+from binpick.result import PartMessage
 from binpick.settings.mesh import Mesh
 from binpick.sim import exam as frozen
 from binpick.sim.mesh import part_mesh

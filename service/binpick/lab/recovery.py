@@ -13,11 +13,13 @@ from binpick.camera import backends
 from binpick.cell import machine, worker
 from binpick.cell.board import Board
 from binpick.cell.gallery import Gallery
+from binpick.cell.meter import Meter
 from binpick.cell.worker import Worker
+from binpick.cycle import CycleInput, CycleResult
 from binpick.errors import Code, CycleRefused
 from binpick.lab import footprint
 from binpick.lab.rig import Plan, Rig, free
-from binpick.result import CycleInput, CycleResult, Request, Result, ReturnCode
+from binpick.result import Request, Result, ReturnCode
 from binpick.rig import Rig as RigFile
 from binpick.settings.cell import AravisCameras, CameraAddress
 
@@ -47,7 +49,7 @@ class Cell:
             for name, T in (("left", EYE), ("right", ((1.0, 0.0, 0.0, -0.15), *EYE[1:])))]})
         self._board = Board(machine.State(max_age_ns=NEVER_NS), 1, "rest")
         self._thread = worker.thread(Worker(self._board, Gallery(), backends.group(self._settings.cameras), rig, _accept,
-                                            lambda _, cycle, __: cycle, None, time.monotonic_ns))
+                                            lambda _, cycle, __: cycle, None, time.monotonic_ns, Meter(rig)))
 
     def __enter__(self) -> "Cell":
         self._thread.start()
