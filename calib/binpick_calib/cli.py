@@ -34,19 +34,22 @@ def solve(
     board: Annotated[str, typer.Option(metavar="SPEC", help="Inner corners and side of a square in metres: "
                                                             "chessboard:9x6:0.025.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
+    camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Calibrate both cameras from images of a chessboard.
+    """Calibrate two or more cameras from images of a chessboard.
 
     Partners are matched by the number in their names. Ten or more views, tilted every way and
-    filling the image corners, make a good rig; the row error should stay below 0.2 px.
+    filling the image corners, make a good rig; the row error should stay below 0.2 px. Views that
+    disagree with the others are left out and named, with the reason; if most disagree, or the rig
+    that comes out cannot be, nothing is written.
     """
     spec = boards.parse(board)
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
-    pairs, alone = viewing.match(left, right)
+    shots, alone = viewing.match(left, right, *(camera or ()))
     screen = Console(stderr=True)
-    watched = track(pairs, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
+    watched = track(shots, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
     views = viewing.detect(watched, spec)
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
     try:
@@ -63,32 +66,37 @@ def solve(
 
 def figures(solution: Solution, board: Board) -> dict[str, Any]:
     """What a calibration is judged by."""
-    left, right = solution.rig.cameras
-    baseline_m = float(np.linalg.norm(right.T_camera_rig[:3, 3]))
+    cameras = solution.rig.cameras
+    baseline_m = float(np.linalg.norm(cameras[1].T_camera_rig[:3, 3]))
     return {
         "views": len(solution.per_view_px),
         "rms_px": solution.quality.rms_px,
         "row_error_px": solution.quality.row_error_px,
-        "focal_px": {"left": [left.K[0][0], left.K[1][1]], "right": [right.K[0][0], right.K[1][1]]},
+        "distortion_model": solution.quality.distortion_model,
+        "focal_px": {camera.name: [camera.K[0][0], camera.K[1][1]] for camera in cameras},
         "baseline_m": baseline_m,
         "baseline_squares": baseline_m / board.square_m,
-        "per_view_px": {str(number): list(both) for number, both in solution.per_view_px.items()},
+        "sigma": solution.quality.sigma,
+        "per_view_px": {str(number): [px if np.isfinite(px) else None for px in each]
+                        for number, each in solution.per_view_px.items()},
     }
 
 
 def show(console: Console, solution: Solution, board: Board, unused: dict[str, str]) -> None:
     """The figures for people: each view's residual, the whole, and what was not used."""
-    views = Table("view", "left px", "right px", title="Residual of each view (rms)")
-    for number, (left_px, right_px) in solution.per_view_px.items():
-        views.add_row(str(number), f"{left_px:.3f}", f"{right_px:.3f}")
-    told = figures(solution, board)
+    told, sigma = figures(solution, board), solution.quality.sigma or {}
+    views = Table("view", *(f"{camera.name} px" for camera in solution.rig.cameras), title="Residual of each view (rms)")
+    for number, each in solution.per_view_px.items():
+        views.add_row(str(number), *(f"{px:.3f}" if np.isfinite(px) else "-" for px in each))
     whole = Table(show_header=False, title="Rig")
     whole.add_row("views used", str(told["views"]))
     whole.add_row("stereo rms", f"{told['rms_px']:.3f} px")
     whole.add_row("row error after rectification (median)", f"{told['row_error_px']:.3f} px")
     for side, (fx, fy) in told["focal_px"].items():
-        whole.add_row(f"focal length {side}", f"{fx:.2f}, {fy:.2f} px")
-    whole.add_row("baseline", f"{told['baseline_m']:.5f} m = {told['baseline_squares']:.3f} squares")
+        whole.add_row(f"focal length {side}", f"{fx:.2f}, {fy:.2f} ± {sigma[f'{side}.fx_px']:.2f} px")
+    whole.add_row("distortion", str(told["distortion_model"]))
+    whole.add_row("baseline", f"{told['baseline_m']:.5f} ± {sigma['right.distance_m']:.5f} m "
+                              f"= {told['baseline_squares']:.3f} squares")
     console.print(views, whole)
     for name, reason in unused.items():
         console.print(f"not used: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
