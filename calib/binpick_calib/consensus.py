@@ -12,8 +12,8 @@ from binpick.geometry import Transform
 from binpick_calib import bundle as bundles
 from binpick_calib.bundle import Bundle, Lens, Seen
 
-START = (0, 1)
-"""The distortion terms that are fitted while the views are still judged: k1 and k2 suit every lens."""
+START = (0, 1, 2, 3)
+"""The distortion terms that are fitted while the views are still judged: k1 k2 p1 p2 suit every lens but the widest."""
 OUTLYING = 2.5
 """Times the median misfit of the views that agree; sharp views of real sets differ by 1.5 at most."""
 CONTRADICTING = 2.0

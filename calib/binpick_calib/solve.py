@@ -63,7 +63,8 @@ def _step(boards: dict[int, geometry.Transform], seen: Sequence[Seen], own: bund
     """A first guess: the view in the middle of all, by position."""
     each = [bundles.place(own, s) @ geometry.inverse(boards[s.view]) for s in seen]
     places = np.array([T[:3, 3] for T in each])
-    return each[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+    middle: geometry.Transform = each[int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
+    return middle
 
 
 def seen_by(view: View, camera: int, board: Board) -> Seen:

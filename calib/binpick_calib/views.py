@@ -38,7 +38,7 @@ class View:
 
     number: int
     names: tuple[str, ...]
-    corners_px: tuple[Float32[np.ndarray, "n 2"], ...]
+    corners_px: tuple[Float32[np.ndarray, "_ 2"], ...]
     edge_px: tuple[float, ...]
 
 
