@@ -1,6 +1,7 @@
 """The command line `binpick-calib`: every fault is one line on stderr and an exit code."""
 
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from rich.table import Table
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick_calib import board as boards
+from binpick_calib import loose
 from binpick_calib import views as viewing
 from binpick_calib.board import Board
 from binpick_calib.solve import Solution
@@ -52,16 +54,43 @@ def solve(
     watched = track(shots, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
     views = viewing.detect(watched, spec)
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
-    try:
-        out.write_bytes(rigs.dump(solution.rig))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
+    _write(out, rigs.dump(solution.rig))
     unused = alone | views.rejected
     if as_json:
         typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
     else:
         show(Console(), solution, spec, unused)
         typer.echo(f"Written: {out}")
+
+
+@app.command(name="import")
+def import_loose(
+    files: Annotated[list[Path], typer.Argument(metavar="FILES", help="K, distortion, R and T: .npy .npz .yml .xml.")],
+    image_size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images they belong to, px: 1936x1216.")],
+    unit_m: Annotated[float, typer.Option(min=1e-6, max=10, help="Metres in one unit of T: 0.001 for mm.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
+) -> None:
+    """Make a rig file of loose OpenCV parameters: camera matrices, distortion, R and T in files of their own.
+
+    They are known by name: M1 M2 D1 D2 R T, cameraMatrixL distL, mtx_left dist_left, K1 D1. What no
+    real rig looks like is refused. Nothing tells how good they are: the rig file has no quality.
+    """
+    size = re.fullmatch(r"(\d{2,5})x(\d{2,5})", image_size.strip().lower())
+    if not size:
+        raise InputError(f"--image-size {image_size}: write it as 1936x1216")
+    rig = loose.rig_of(files, (int(size[1]), int(size[2])), unit_m, datetime.now(UTC).isoformat(timespec="seconds"))
+    _write(out, rigs.dump(rig))
+    left, right = rig.cameras
+    typer.echo(f"focal length {left.K[0][0]:.1f}, {right.K[0][0]:.1f} px; "
+               f"baseline {1000 * float(np.linalg.norm(right.T_camera_rig[:3, 3])):.2f} mm")
+    typer.echo(f"Written: {out}")
+
+
+def _write(out: Path, content: bytes) -> None:
+    try:
+        out.write_bytes(content)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
 
 
 def figures(solution: Solution, board: Board) -> dict[str, Any]:
