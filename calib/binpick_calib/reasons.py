@@ -24,8 +24,9 @@ def reason(pair: Both, pairs: Sequence[Both], found: Agreement, width_px: int) -
     within_px = max(found.limit_px, TELLING * leaves_px(first, second))
     explained = {"left and right are exchanged in this view": leaves_px(second, first),
                  "both images of this view are mirrored": leaves_px(mirrored(first, width_px), mirrored(second, width_px))}
-    explained |= {f"wrong partner: its second image belongs to the first image of view {other.first.view}":
-                  leaves_px(other.first, second) for other in pairs if other is not pair}
+    if min(explained.values()) > within_px:    # a search over all views only where nothing nearer explains it
+        explained |= {f"wrong partner: its second image belongs to the first image of view {other.first.view}":
+                      leaves_px(other.first, second) for other in pairs if other is not pair}
     best = min(explained, key=lambda why: explained[why])
     if explained[best] <= within_px:
         return best

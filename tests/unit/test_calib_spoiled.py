@@ -41,7 +41,7 @@ class Clean:
         return views.Views(self.seen.image_size_px, kept, rejected)
 
 
-@pytest.fixture(scope="module", params=SETS)
+@pytest.fixture(scope="module", params=["opencv", pytest.param("titania", marks=pytest.mark.slow)])
 def clean(request: pytest.FixtureRequest) -> Clean:
     folder, left, right, spec = SETS[request.param]
     if not folder.is_dir():
