@@ -62,6 +62,14 @@ def find(image: UInt8[np.ndarray, "h w"], board: Board) -> Float32[np.ndarray, "
     return _from_the_same_corner(refined.reshape(board.rows, board.columns, 2), image).reshape(-1, 2)
 
 
+def edge_px(image: UInt8[np.ndarray, "h w"], corners_px: Float32[np.ndarray, "n 2"], board: Board) -> float:
+    """How wide the printed edges are, from 10 to 90 % of their contrast: blur of lens, motion and focus together."""
+    grid = corners_px.reshape(-1, 1, 2)
+    # a hand moves the board one way: across that way the edges stay sharp
+    return max(float(cv2.estimateChessboardSharpness(image, (board.columns, board.rows), grid, 0.8, upright)[0][0])
+               for upright in (False, True))
+
+
 def _from_the_same_corner(grid: Float32[np.ndarray, "r c 2"], image: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "r c 2"]:
     rows, columns = grid.shape[:2]
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
@@ -77,7 +85,9 @@ def _from_the_same_corner(grid: Float32[np.ndarray, "r c 2"], image: UInt8[np.nd
 def align(left_px: Float32[np.ndarray, "n 2"], right_px: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
     """The right corners, turned end to end when they are numbered against the left ones.
 
-    Cameras of a rig stand upright to each other within far less than 90 degrees.
+    Cameras of a rig stand upright to each other within far less than 90 degrees. A board seen in part carries numbers.
     """
+    if np.isnan(left_px).any() or np.isnan(right_px).any():
+        return right_px
     same_way = (left_px[-1] - left_px[0]) @ (right_px[-1] - right_px[0]) > 0
     return right_px if same_way else np.ascontiguousarray(right_px[::-1])

@@ -1,6 +1,7 @@
 """The command line `binpick-calib`: every fault is one line on stderr and an exit code."""
 
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from rich.table import Table
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick_calib import board as boards
+from binpick_calib import loose
 from binpick_calib import views as viewing
 from binpick_calib.board import Board
 from binpick_calib.solve import Solution
@@ -34,25 +36,25 @@ def solve(
     board: Annotated[str, typer.Option(metavar="SPEC", help="Inner corners and side of a square in metres: "
                                                             "chessboard:9x6:0.025.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
+    camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Calibrate both cameras from images of a chessboard.
+    """Calibrate two or more cameras from images of a chessboard.
 
     Partners are matched by the number in their names. Ten or more views, tilted every way and
-    filling the image corners, make a good rig; the row error should stay below 0.2 px.
+    filling the image corners, make a good rig; the row error should stay below 0.2 px. Views that
+    disagree with the others are left out and named, with the reason; if most disagree, or the rig
+    that comes out cannot be, nothing is written.
     """
     spec = boards.parse(board)
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
-    pairs, alone = viewing.match(left, right)
+    shots, alone = viewing.match(left, right, *(camera or ()))
     screen = Console(stderr=True)
-    watched = track(pairs, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
+    watched = track(shots, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
     views = viewing.detect(watched, spec)
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
-    try:
-        out.write_bytes(rigs.dump(solution.rig))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
+    _write(out, rigs.dump(solution.rig))
     unused = alone | views.rejected
     if as_json:
         typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
@@ -61,34 +63,69 @@ def solve(
         typer.echo(f"Written: {out}")
 
 
+@app.command(name="import")
+def import_loose(
+    files: Annotated[list[Path], typer.Argument(metavar="FILES", help="K, distortion, R and T: .npy .npz .yml .xml.")],
+    image_size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images they belong to, px: 1936x1216.")],
+    unit_m: Annotated[float, typer.Option(min=1e-6, max=10, help="Metres in one unit of T: 0.001 for mm.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
+) -> None:
+    """Make a rig file of loose OpenCV parameters: camera matrices, distortion, R and T in files of their own.
+
+    They are known by name: M1 M2 D1 D2 R T, cameraMatrixL distL, mtx_left dist_left, K1 D1. What no
+    real rig looks like is refused. Nothing tells how good they are: the rig file has no quality.
+    """
+    size = re.fullmatch(r"(\d{2,5})x(\d{2,5})", image_size.strip().lower())
+    if not size:
+        raise InputError(f"--image-size {image_size}: write it as 1936x1216")
+    rig = loose.rig_of(files, (int(size[1]), int(size[2])), unit_m, datetime.now(UTC).isoformat(timespec="seconds"))
+    _write(out, rigs.dump(rig))
+    left, right = rig.cameras
+    typer.echo(f"focal length {left.K[0][0]:.1f}, {right.K[0][0]:.1f} px; "
+               f"baseline {1000 * float(np.linalg.norm(right.T_camera_rig[:3, 3])):.2f} mm")
+    typer.echo(f"Written: {out}")
+
+
+def _write(out: Path, content: bytes) -> None:
+    try:
+        out.write_bytes(content)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
+
+
 def figures(solution: Solution, board: Board) -> dict[str, Any]:
     """What a calibration is judged by."""
-    left, right = solution.rig.cameras
-    baseline_m = float(np.linalg.norm(right.T_camera_rig[:3, 3]))
+    cameras = solution.rig.cameras
+    baseline_m = float(np.linalg.norm(cameras[1].T_camera_rig[:3, 3]))
     return {
         "views": len(solution.per_view_px),
         "rms_px": solution.quality.rms_px,
         "row_error_px": solution.quality.row_error_px,
-        "focal_px": {"left": [left.K[0][0], left.K[1][1]], "right": [right.K[0][0], right.K[1][1]]},
+        "distortion_model": solution.quality.distortion_model,
+        "focal_px": {camera.name: [camera.K[0][0], camera.K[1][1]] for camera in cameras},
         "baseline_m": baseline_m,
         "baseline_squares": baseline_m / board.square_m,
-        "per_view_px": {str(number): list(both) for number, both in solution.per_view_px.items()},
+        "sigma": solution.quality.sigma,
+        "per_view_px": {str(number): [px if np.isfinite(px) else None for px in each]
+                        for number, each in solution.per_view_px.items()},
     }
 
 
 def show(console: Console, solution: Solution, board: Board, unused: dict[str, str]) -> None:
     """The figures for people: each view's residual, the whole, and what was not used."""
-    views = Table("view", "left px", "right px", title="Residual of each view (rms)")
-    for number, (left_px, right_px) in solution.per_view_px.items():
-        views.add_row(str(number), f"{left_px:.3f}", f"{right_px:.3f}")
-    told = figures(solution, board)
+    told, sigma = figures(solution, board), solution.quality.sigma or {}
+    views = Table("view", *(f"{camera.name} px" for camera in solution.rig.cameras), title="Residual of each view (rms)")
+    for number, each in solution.per_view_px.items():
+        views.add_row(str(number), *(f"{px:.3f}" if np.isfinite(px) else "-" for px in each))
     whole = Table(show_header=False, title="Rig")
     whole.add_row("views used", str(told["views"]))
     whole.add_row("stereo rms", f"{told['rms_px']:.3f} px")
     whole.add_row("row error after rectification (median)", f"{told['row_error_px']:.3f} px")
     for side, (fx, fy) in told["focal_px"].items():
-        whole.add_row(f"focal length {side}", f"{fx:.2f}, {fy:.2f} px")
-    whole.add_row("baseline", f"{told['baseline_m']:.5f} m = {told['baseline_squares']:.3f} squares")
+        whole.add_row(f"focal length {side}", f"{fx:.2f}, {fy:.2f} ± {sigma[f'{side}.fx_px']:.2f} px")
+    whole.add_row("distortion", str(told["distortion_model"]))
+    whole.add_row("baseline", f"{told['baseline_m']:.5f} ± {sigma['right.distance_m']:.5f} m "
+                              f"= {told['baseline_squares']:.3f} squares")
     console.print(views, whole)
     for name, reason in unused.items():
         console.print(f"not used: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)

@@ -1,41 +1,48 @@
-"""Views: a left and a right image of the same moment, and the board's corners in both."""
+"""Views: the images of one moment, one of each camera, and the board's corners in them."""
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from binpick.errors import ImageError, InputError
 from binpick_calib import board as boards
 from binpick_calib.board import Board
 
 FEWEST_VIEWS = 5
+FEWEST_CORNERS = 8
+"""Of a board seen in part: fewer leave its tilt to chance."""
+BLURRED = 1.7
+"""Times the median width of an edge: of one lens and one board, sharp views differ by 1.4 at most (far and oblique ones)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
-    """Two files that carry the same number."""
+class Shot:
+    """The files that carry the same number, one of each camera; None where a further camera has none."""
 
     number: int
-    left: Path
-    right: Path
+    files: tuple[Path | None, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The corners of one pair, in the order of the board's points."""
+    """The corners of one shot, for each camera in the order of the board's points; NaN = this corner was not seen.
+
+    Any detector may fill it. `edge_px`: the width of the printed edges in each image (10 to 90 %), NaN = not measured.
+    """
 
     number: int
-    left_px: Float32[np.ndarray, "n 2"]
-    right_px: Float32[np.ndarray, "n 2"]
+    names: tuple[str, ...]
+    corners_px: tuple[Float32[np.ndarray, "_ 2"], ...]
+    edge_px: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Views:
     """Everything that can be solved from, and what cannot, with the reason by file name."""
 
@@ -44,25 +51,31 @@ class Views:
     rejected: dict[str, str]
 
 
-def match(left: str, right: str) -> tuple[list[Pair], dict[str, str]]:
-    """Pairs by the number in the names of two patterns' files, and the files without a partner, with the reason.
+def match(*patterns: str) -> tuple[list[Shot], dict[str, str]]:
+    """Shots by the number in the names of the patterns' files (left, right, further cameras), and the files without a partner.
 
-    Raises InputError when a pattern finds nothing, when two files of a side carry the same number, or no pair is left.
+    Raises InputError when a pattern finds nothing, when two files of a side carry the same number, or no shot is left.
     """
-    found = {"left": _files(left, "left"), "right": _files(right, "right")}
+    found = {side: _files(pattern, side) for side, pattern in zip(sides(len(patterns)), patterns, strict=True)}
     numbers = {path: [int(digits) for digits in re.findall(r"\d+", path.stem)] for files in found.values() for path in files}
     place = _counting_place([[numbers[path] for path in files if numbers[path]] for files in found.values()])
-    sides = {side: {numbers[path][place]: path for path in files if numbers[path]} for side, files in found.items()}
-    pairs = [Pair(number, path, sides["right"][number]) for number, path in sorted(sides["left"].items())
-             if number in sides["right"]]
-    if not pairs:
+    numbered = [{numbers[path][place]: path for path in files if numbers[path]} for files in found.values()]
+    shots = [Shot(number, (path, *(other.get(number) for other in numbered[1:])))
+             for number, path in sorted(numbered[0].items()) if any(number in other for other in numbered[1:])]
+    if not shots:
         raise InputError("no left and right image carry the same number in their names "
                          f"(such as {found['left'][0].name} and {found['right'][0].name})")
-    if pairs[0].left.samefile(pairs[0].right):
-        raise InputError(f"--left and --right both find {pairs[0].left}; give each side its own pattern")
-    partnered = {path for pair in pairs for path in (pair.left, pair.right)}
-    return pairs, {path.name: f"no partner with number {of[place]}" if of else "no number in its name"
+    partnered = [path for shot in shots for path in shot.files if path is not None]
+    if len(set(partnered)) < len(partnered):
+        again = next(path for path in partnered if partnered.count(path) > 1)
+        raise InputError(f"--left and --right both find {again}; give each side its own pattern")
+    return shots, {path.name: f"no partner with number {of[place]}" if of else "no number in its name"
                    for path, of in numbers.items() if path not in partnered}
+
+
+def sides(count: int) -> tuple[str, ...]:
+    """What the cameras are called: left, right, camera3, ..."""
+    return ("left", "right", *(f"camera{n}" for n in range(3, count + 1)))
 
 
 def _files(pattern: str, side: str) -> list[Path]:
@@ -86,33 +99,70 @@ def _counting_place(sides: list[list[list[int]]]) -> int:
     return -1
 
 
-def detect(pairs: Iterable[Pair], board: Board) -> Views:
-    """Finds the board in every pair. Raises ImageError for images of another size, InputError for too few views."""
+def detect(shots: Iterable[Shot], board: Board) -> Views:
+    """Finds the board in every shot. Raises ImageError for images of another size, InputError for too few views."""
     size: tuple[int, int] | None = None
     used: list[View] = []
     rejected: dict[str, str] = {}
-    for pair in pairs:
-        corners = []
-        for path in (pair.left, pair.right):
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-            if image is None:
-                rejected[path.name] = "cannot be read as an image"
-                continue
-            this_size = (image.shape[1], image.shape[0])
-            size = size or this_size
-            if this_size != size:
-                raise ImageError(f"{path}: {this_size[0]}x{this_size[1]} px, but the images before it are "
-                                 f"{size[0]}x{size[1]}: all must come from cameras with the same settings")
-            found = boards.find(image, board)
-            if found is None:
-                rejected[path.name] = f"no board with {board.columns}x{board.rows} inner corners seen"
+    for shot in shots:
+        corners, edges = [], []
+        for path in shot.files:
+            seen, edge = np.full((board.columns * board.rows, 2), np.nan, np.float32), np.nan
+            if path is not None:
+                image = _read(path)
+                if image is None:
+                    rejected[path.name] = "cannot be read as an image"
+                else:
+                    size = size or (image.shape[1], image.shape[0])
+                    _same_size(path, image, size)
+                    found = boards.find(image, board)
+                    if found is None:
+                        rejected[path.name] = f"no board with {board.columns}x{board.rows} inner corners seen"
+                    else:
+                        seen, edge = found, boards.edge_px(image, found, board)
+            corners.append(seen)
+            edges.append(edge)
+        aligned = [corners[0], *(boards.align(corners[0], other) for other in corners[1:])]
+        names = tuple("" if path is None else path.name for path in shot.files)
+        used.append(View(shot.number, names, tuple(aligned), tuple(edges)))
+    sharp, blurred = screen(used)
+    rejected |= blurred
+    if size is None or len(sharp) < FEWEST_VIEWS:
+        raise InputError(f"the board was found in {len(sharp)} pairs, {FEWEST_VIEWS} are needed{_why(rejected)}")
+    return Views(size, sharp, rejected)
+
+
+def _read(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def _same_size(path: Path, image: UInt8[np.ndarray, "h w"], size: tuple[int, int]) -> None:
+    this_size = (image.shape[1], image.shape[0])
+    if this_size != size:
+        raise ImageError(f"{path}: {this_size[0]}x{this_size[1]} px, but the images before it are "
+                         f"{size[0]}x{size[1]}: all must come from cameras with the same settings")
+
+
+def screen(views: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
+    """The views that the first and one more camera see sharply and wholly enough, and the reason of each image that is not."""
+    typical = [np.nanmedian(widths) if np.isfinite(widths).any() else np.inf
+               for widths in np.array([view.edge_px for view in views]).T]
+    kept, rejected = [], {}
+    for view in views:
+        corners = list(view.corners_px)
+        for camera, (name, px, edge) in enumerate(zip(view.names, view.corners_px, view.edge_px, strict=True)):
+            seen = int(np.isfinite(px).all(axis=1).sum())
+            if edge > BLURRED * typical[camera]:
+                rejected[name] = f"blurred: its edges are {edge:.1f} px wide, those of the other views {typical[camera]:.1f} px"
+            elif 0 < seen < FEWEST_CORNERS:
+                rejected[name] = f"half seen: {seen} of {len(px)} corners"
             else:
-                corners.append(found)
-        if len(corners) == 2:
-            used.append(View(pair.number, corners[0], boards.align(corners[0], corners[1])))
-    if size is None or len(used) < FEWEST_VIEWS:
-        raise InputError(f"the board was found in {len(used)} pairs, {FEWEST_VIEWS} are needed{_why(rejected)}")
-    return Views(size, tuple(used), rejected)
+                continue
+            corners[camera] = np.full_like(px, np.nan)
+        there = [bool(np.isfinite(px).any()) for px in corners]
+        if there[0] and any(there[1:]):
+            kept.append(replace(view, corners_px=tuple(corners)))
+    return tuple(kept), rejected
 
 
 def _why(rejected: dict[str, str]) -> str:

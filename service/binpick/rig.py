@@ -55,12 +55,16 @@ class Quality(Part):
     """How well the calibration fits: residuals in px, and which views were not used and why.
 
     `hand_eye_rms_m` and `hand_eye_rms_rad`: how well T_base_rig or T_flange_rig agree with the robot, absent if never measured.
+    `distortion_model`: the terms there was evidence for. `sigma`: one standard deviation of the parameters, by name and unit,
+    from the scatter of the corners alone: what every view has wrong in common (a bent board) is not in it.
     """
 
     rms_px: float
     row_error_px: float
     hand_eye_rms_m: Annotated[float, Field(ge=0)] | None = None
     hand_eye_rms_rad: Annotated[float, Field(ge=0)] | None = None
+    distortion_model: str | None = None
+    sigma: dict[str, float] | None = None
     per_view_px: dict[str, float] = {}
     rejected: dict[str, str] = {}
 

@@ -97,8 +97,8 @@ def test_opencv_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     quality = rig.load(tmp_path / "rig.json")[0].quality
     assert quality is not None
     assert len(quality.per_view_px) == 13
-    assert quality.rms_px <= 0.25
-    assert quality.row_error_px <= 0.15
+    assert quality.rms_px <= 0.22
+    assert quality.row_error_px <= 0.13
     T = rig.load(tmp_path / "rig.json")[0].cameras[1].T_camera_rig
     assert np.linalg.norm(T[:3, 3]) / 0.025 == pytest.approx(3.33, abs=0.02)
 
@@ -108,8 +108,9 @@ def test_board_that_looks_the_same_upside_down() -> None:
     board = boards.parse("chessboard:10x6:0.025")
     pairs, alone = views.match(str(TITANIA / "*_l.png"), str(TITANIA / "*_r.png"))
     assert alone == {}
-    solution = solve.solve(views.detect(pairs[:6], board), board, "2026-01-01")
-    assert solution.quality.rms_px < 0.1
+    solution = solve.solve(views.detect(pairs, board), board, "2026-01-01")
+    assert len(solution.per_view_px) == 13
+    assert solution.quality.rms_px <= 0.07
 
 
 def test_a_turned_image_numbers_the_same_printed_corner(shots: Path) -> None:
@@ -136,7 +137,7 @@ def test_partners_are_found_by_number_not_by_order(tmp_path: Path) -> None:
     for old in tmp_path.glob("*_b1.png"):
         old.rename(tmp_path / old.name.replace("b1", "b"))
     pairs, alone = views.match(str(tmp_path / "cam*.png"), str(tmp_path / "*_b.png"))
-    assert [(p.number, p.left.name, p.right.name) for p in pairs] == [
+    assert [(p.number, *(path.name for path in p.files)) for p in pairs] == [
         (2, "cam0_2.png", "002_b.png"), (10, "cam0_10.png", "10_b.png")]
     assert alone == {"CAM0_3.PNG": "no partner with number 3", "4_b.png": "no partner with number 4",
                      "x_b.png": "no number in its name"}
@@ -147,7 +148,7 @@ def test_the_camera_may_be_numbered_too(tmp_path: Path) -> None:
         for camera in (0, 1):
             (tmp_path / f"{number:04d}_cam{camera}.png").touch()
     pairs, _ = views.match(str(tmp_path / "*cam0.png"), str(tmp_path / "*cam1.png"))
-    assert [(p.left.name, p.right.name) for p in pairs] == [
+    assert [tuple(path.name for path in p.files) for p in pairs] == [
         ("0001_cam0.png", "0001_cam1.png"), ("0002_cam0.png", "0002_cam1.png")]
 
 
