@@ -104,7 +104,7 @@ def detect(pairs: Iterable[Pair], board: Board) -> Views:
                 raise ImageError(f"{path}: {this_size[0]}x{this_size[1]} px, but the images before it are "
                                  f"{size[0]}x{size[1]}: all must come from cameras with the same settings")
             found = boards.find(image, board)
-            if found is None:
+            if found is None or np.isnan(found).any():
                 rejected[path.name] = f"no board with {board.columns}x{board.rows} inner corners seen"
             else:
                 corners.append(found)

@@ -217,6 +217,14 @@ def test_quality_says_how_the_board_stands(tilt_deg: tuple[float, float, float])
     assert quality.contrast > 100
 
 
+def test_a_board_moved_by_hand_is_not_called_sharp() -> None:
+    board = parse("chessboard:9x6:0.025")
+    image, _ = photograph(board, (20.0, 15.0, 0.0))
+    still, moved = (sight.find(shown, board) for shown in (image, cv2.blur(image, (9, 1))))
+    assert still.quality.blur_px < 1.3
+    assert moved.quality.blur_px > 2
+
+
 def test_what_is_no_board_is_refused_with_the_reason() -> None:
     board = parse("chessboard:9x6:0.025")
     assert "all one grey (60 to 60 of 255)" in sight.find(np.full((480, 640), 60, np.uint8), board).reason

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from binpick.data import Image
-from binpick.rigcheck.board import Board
+from binpick.rigcheck.board import Board, Kind
 
 GRID = 3
 """The image is divided into this many cells each way: a good set of views has its middles in all of them."""
@@ -96,26 +96,35 @@ def edges(image: Image, board: Board, ids: Int32[np.ndarray, "n"],
           corners_px: Float32[np.ndarray, "n 2"]) -> tuple[float, float]:
     """Sigma of the board's edges, px, and its contrast, grey levels: medians over profiles between neighbouring points.
 
-    Between two corners of a chessboard the edge is crossed at half way, square to it; between two dots the profile leaves
-    the one and enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
+    Of rows and columns the softer counts: a hand moves a board one way, and across that way the edges stay sharp. Between two
+    corners of a chessboard the edge is crossed at half way, square to it; between two dots the profile leaves the one and
+    enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
     """
     pairs = neighbours(board, ids)
-    if not len(pairs):
-        return float("nan"), 0.0
+    in_row = ids[pairs[:, 1]] - ids[pairs[:, 0]] == 1
+    both = [_edge(*_profiles(image, board, corners_px, pairs[way])) for way in (in_row, ~in_row) if way.any()]
+    sigmas = [sigma_px for sigma_px, _ in both if np.isfinite(sigma_px)]
+    return max(sigmas, default=float("nan")), min((contrast for _, contrast in both), default=0.0)
+
+
+def _profiles(image: Image, board: Board, corners_px: Float32[np.ndarray, "n 2"],
+              pairs: Int32[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, "k 65"], Float[np.ndarray, "k"]]:
+    """Grey levels along lines across the edges between neighbours, and the distance of two samples, px."""
     start, along = corners_px[pairs[:, 0]], corners_px[pairs[:, 1]] - corners_px[pairs[:, 0]]
-    if "circles" not in board.kind:
+    if board.kind in (Kind.CHESSBOARD, Kind.CHARUCO):
         start, along = start + along / 2, np.stack([-along[:, 1], along[:, 0]], axis=1)
         start = start - along / 2
-    samples = 65
-    share = np.linspace(0, 1, samples, dtype=np.float32)
-    at = start[:, None] + share[:, None] * along[:, None]
-    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
-    step_px = np.linalg.norm(along, axis=1) / (samples - 1)
+    at = start[:, None] + np.linspace(0, 1, 65, dtype=np.float32)[:, None] * along[:, None]
+    values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return values.astype(np.float64), np.linalg.norm(along, axis=1).astype(np.float64) / 64
+
+
+def _edge(values: Float[np.ndarray, "k 65"], step_px: Float[np.ndarray, "k"]) -> tuple[float, float]:
+    """Medians of sigma (NaN where all is flat) and contrast."""
     # over one pixel and more: linear interpolation between pixels has no slopes within them
-    wide = max(1, round(float(1 / np.median(step_px))))
+    wide = min(64, max(1, round(float(1 / np.median(step_px)))))
     slope = np.abs(values[:, wide:] - values[:, :-wide]).max(1) / (wide * step_px)
     contrast = np.quantile(values, 0.9, axis=1) - np.quantile(values, 0.1, axis=1)
-    usable = slope > 0
-    if not usable.any():
-        return float("nan"), 0.0
-    return (float(np.median(contrast[usable] / (slope[usable] * np.sqrt(2 * np.pi)))), float(np.median(contrast)))
+    steep = slope > 0
+    sigma_px = float(np.median(contrast[steep] / (slope[steep] * np.sqrt(2 * np.pi)))) if steep.any() else float("nan")
+    return sigma_px, float(np.median(contrast))
