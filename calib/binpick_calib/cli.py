@@ -15,7 +15,8 @@ from rich.table import Table
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick_calib import board as boards
-from binpick_calib import loose
+from binpick_calib import loose, vector
+from binpick_calib import sheet as sheets
 from binpick_calib import views as viewing
 from binpick_calib.board import Board
 from binpick_calib.solve import Solution
@@ -84,6 +85,22 @@ def import_loose(
     typer.echo(f"focal length {left.K[0][0]:.1f}, {right.K[0][0]:.1f} px; "
                f"baseline {1000 * float(np.linalg.norm(right.T_camera_rig[:3, 3])):.2f} mm")
     typer.echo(f"Written: {out}")
+
+
+@app.command("board")
+def print_board(
+    board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as solve is told it: chessboard:9x6:0.025, "
+                                                            "charuco:9x6:0.025, circles:9x7:0.02, acircles:4x11:0.02.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The file to write: .pdf or .svg.")],
+    page: Annotated[str, typer.Option(metavar="SIZE", help=f"{', '.join(sheets.PAGES_MM)}, or width and height in mm: "
+                                                           "600x400.")] = "a4",
+) -> None:
+    """Write a board to print at true scale, with a ruler of 100 mm to check the print by."""
+    if out.suffix.lower() not in (".pdf", ".svg"):
+        raise InputError(f"--out {out}: write a .pdf or an .svg file")
+    sheet = sheets.layout(boards.parse(board), page)
+    _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
+    typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
 
 
 def _write(out: Path, content: bytes) -> None:
