@@ -35,7 +35,7 @@ def solve(
     left: Annotated[str, typer.Option(metavar="GLOB", help="Images of the left camera, quoted: 'shots/left*.png'.")],
     right: Annotated[str, typer.Option(metavar="GLOB", help="Images of the right camera.")],
     board: Annotated[str, typer.Option(metavar="SPEC", help="Inner corners and side of a square in metres: "
-                                                            "chessboard:9x6:0.025.")],
+                                                            "chessboard:9x6:0.025 (or charuco, circles, acircles).")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
     camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
