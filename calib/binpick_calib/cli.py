@@ -40,7 +40,7 @@ def solve(
     camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Calibrate two or more cameras from images of a chessboard.
+    """Calibrate two or more cameras from images of a board.
 
     Partners are matched by the number in their names. Ten or more views, tilted every way and
     filling the image corners, make a good rig; the row error should stay below 0.2 px. Views that
