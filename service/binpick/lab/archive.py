@@ -22,7 +22,7 @@ from binpick.sim import exam
 from binpick.sim.world import WorldScene
 
 HOME = Path(binpick.__file__).parent
-RENDERERS = ("sim", "geometry.py", "data.py", "rig.py")
+RENDERERS = ("sim", "geometry", "data.py", "rig.py")
 """The sources that decide what a picture shows."""
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "open3d-cpu", "mujoco", "scipy")
 """Whatever they compute may change with their versions."""
