@@ -17,7 +17,8 @@ STAND_OUT_M = 0.0015
 SEAL_SHARE = 0.95
 """The measured surface may use this share of the compliance."""
 CENTRINGS = 3
-"""Several cups are centred so many times: each time only the cups near an edge say something."""
+"""So many times cups are moved to the middle of what they see of the part: what they see moves along, and of several cups only
+those near an edge say something."""
 FLAT_RAD, CURVED_RAD = 0.08, 0.16
 """Normals under the lips that turn by less are noise, by more a curve (tuning seeds: 97 % of flat faces below 0.09, 95 % of the
 cylinders above): only on a curve does the middle of a lip lie above the plane. In between it counts in part."""
@@ -56,7 +57,7 @@ def _tried(segments: Segments, at: Int32[np.ndarray, "n 2"], T_bin_spot: Float64
            ) -> tuple[Int64[np.ndarray, "k"], list[Grasp], dict[str, int]]:
     """Which spots seal, the grasps there, and how many fell out for which reason."""
     patch = patches(segments, at, T_bin_spot, tool.cups, spacing_m)
-    for _ in tool.cups[:CENTRINGS]:
+    for _ in range(CENTRINGS):
         patch, T_bin_spot = centred(patch, T_bin_spot)
     held = np.flatnonzero(on_one_part(patch))
     reasons = {"rim_not_on_one_part": len(at) - len(held)}
