@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from binpick import cli, demo
-from binpick.camera import backends, controller
+from binpick.camera import backends, probe
 from binpick.errors import CameraLost
 from binpick.settings.cell import AravisCameras, CameraAddress
 from binpick.sim.gige import GigePair
@@ -94,7 +94,7 @@ def test_values_are_those_of_the_camera_and_grep_picks_some(gige: GigePair, call
         ["feature", "access", "value", "may", "be"], ["Width", "RO", "64", "px"],
         ["TriggerMode", "RW", "Off", "Off", "|", "On"], ["TriggerSoftware", "WO"],
         ["ExposureTime", "RW", "5000", "us", "20", "to", "10000000"]]
-    assert controller.of(address) == ""          # let go at once, so that a daemon may take it
+    assert probe.controller(address) == ""          # let go at once, so that a daemon may take it
 
 
 @pytest.mark.gige
@@ -104,7 +104,7 @@ def test_a_camera_that_another_program_controls_is_read_and_not_disturbed(gige: 
     assert code == 0
     assert "controlled by another program" in out
     assert out.splitlines()[2].split() == ["TriggerMode", "RW", "On", "Off", "|", "On"]          # as its controller has set it
-    assert controller.of(address) == "another program"
+    assert probe.controller(address) == "another program"
 
 
 @pytest.mark.gige

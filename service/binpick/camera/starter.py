@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 
 from binpick.camera import action
 from binpick.camera.action import Action
@@ -12,7 +11,6 @@ from binpick.settings.cell import Sync
 
 LEAD_NS = 8_000_000
 """From sending a scheduled action to its time: longer than a busy host takes to send it."""
-_numbers = count(1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +48,7 @@ class Starter:
             at_ns = max(times)
         names = {camera.status().address: camera.name for camera in cameras}
         try:
-            said = action.broadcast(Action(self.device_key, at_ns=at_ns), (next(_numbers) - 1) % 0xFFFF + 1, tuple(names))
+            said = action.broadcast(Action(self.device_key, at_ns=at_ns), tuple(names))
         except OSError as error:
             return f"the action command cannot be sent ({error.strerror or error}): check this host's network"
         return "; ".join(f"camera {names[address]} did not take the action command: {why}"

@@ -112,9 +112,9 @@ def _described(addresses: Iterable[str]) -> "Iterator[Description]":
 
 
 def _row(found: "Found", here: "Host") -> dict[str, str]:
-    from binpick.camera import controller
+    from binpick.camera import probe
 
-    way, held_by = here.way(found.address), controller.of(found.address)
+    way, held_by = here.way(found.address), probe.controller(found.address)
     port = "" if way is None or way.gateway else way.port
     if held_by is None:
         control = "out of reach: another subnet?" if not port else "does not answer"

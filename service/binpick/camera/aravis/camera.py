@@ -57,9 +57,7 @@ class AravisCamera:
         facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
         self._status = replace(self._status, connected=True, error="", address=address, **facts)
         self._away = False
-        if self._link is None:
-            self._link = Link(address)
-        self._link.forget()
+        self._link = Link(address)
 
     def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
         """Exposure, gain, and whether the line that strobes the projector does so."""
