@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from binpick.camera import action
+from binpick.camera import action, proof
 from binpick.camera.action import Action
 from binpick.camera.base import Camera, Clock
 from binpick.data import CameraStatus
@@ -31,7 +31,7 @@ class Starter:
     def unready(self, statuses: Sequence[CameraStatus]) -> str:
         """Why no shot can be started, "" when one can: a time for all means nothing without PTP."""
         states = [status.ptp for status in statuses]
-        if self.sync != "scheduled_action" or (states.count("Master") <= 1 and set(states) in ({"Master", "Slave"}, {"Slave"})):
+        if self.sync != "scheduled_action" or proof.together(states):
             return ""
         said = ", ".join(f"{status.name} {status.ptp or 'without PTP'}" for status in statuses)
         return f"the cameras' clocks do not keep together by PTP ({said}): are they on one switch?"
