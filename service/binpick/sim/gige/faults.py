@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from binpick.camera.base import NAMES
 from binpick.errors import InputError
 from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.conditions import Conditions
 from binpick.sim.gige.features import PTP_STATES
-from binpick.sim.gige.group import NAMES, REBOOT_S, GigeGroup
+from binpick.sim.gige.group import REBOOT_S, GigeGroup
 from binpick.sim.gige.pixels import FORMATS
 
 Deed = Callable[[GigeGroup, int, Any], None]

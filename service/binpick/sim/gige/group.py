@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import TracebackType
 from typing import TypeAlias
 
+from binpick.camera.base import NAMES
 from binpick.data import Image, Light
 from binpick.errors import PortInUse
 from binpick.sim.gige import channel, gvcp
@@ -23,7 +24,6 @@ from binpick.sim.gige.wiring import Edge, Wire, harness, pulse
 
 ImageFn: TypeAlias = Callable[[int, Light, int], Image]
 """(camera index, light, shot number) -> the image; called at the exposure's end on that camera's thread."""
-NAMES = ("left", "right", "third", "fourth", "fifth")
 THIEF: Peer = ("203.0.113.1", 1)
 """Nobody: an address that is reserved for documentation (RFC 5737)."""
 REBOOT_S = 1.0
