@@ -52,7 +52,7 @@ class GigeGroup:
         self._wires = tuple(harness(heads) if wires is None else wires)
         self._timer = Timer()
         self._ledger = Ledger(heads)
-        self._around = Surroundings(expose=image, projector=self._projector, began=self._carry, reset=self._reset, ptp=self.ptp,
+        self._around = Surroundings(expose=image, projector=self._projector, began=self._carry, reset=self.reboot, ptp=self.ptp,
                                     timer=self._timer, ledger=self._ledger)
         self._devices: dict[int, Device] = {}
         self._conditions = [Conditions()] * heads
@@ -126,22 +126,6 @@ class GigeGroup:
         self._timer.call(host_ns(), lambda: self.kill(index))
         self._timer.call(host_ns() + int(after_s * 1e9), lambda: self._revive(index))
 
-    def freeze(self, index: int, answers: bool = True) -> None:
-        """Its images stay away; unless it `answers`, commands and triggers find nobody either. `thaw` or `restart` ends it."""
-        self.change(index, sends=False, answers=answers)
-
-    def thaw(self, index: int) -> None:
-        """It goes on as if nothing had been."""
-        self.change(index, sends=True, answers=True)
-
-    def unplug(self, index: int) -> None:
-        """Its network cable is out; it keeps its power and its settings, and feels its lines."""
-        self.change(index, plugged=False)
-
-    def plug(self, index: int) -> None:
-        """The cable is in again."""
-        self.change(index, plugged=True)
-
     def misfire(self, index: int) -> None:
         """It exposes once without having been asked."""
         self._devices[index].trigger(host_ns())
@@ -167,7 +151,7 @@ class GigeGroup:
 
     def _meet(self, index: int, conditions: Conditions) -> None:
         self._conditions[index] = conditions
-        self.ptp.cut(index, not (conditions.plugged and conditions.answers), host_ns())
+        self.ptp.cut(index, not conditions.reachable, host_ns())
         if index in self._devices:
             self._devices[index].meet(conditions)
 
@@ -218,9 +202,6 @@ class GigeGroup:
             feel()
         else:
             self._timer.call(edge.at_ns, feel)
-
-    def _reset(self, index: int) -> None:
-        self.reboot(index)
 
     def _revive(self, index: int) -> None:
         if not self._stop.is_set():
