@@ -14,7 +14,7 @@ import pytest
 
 from binpick import cli, demo
 from binpick.camera import backends, probe
-from binpick.errors import CameraLost
+from binpick.errors import CameraError, CameraLost
 from binpick.settings.cell import AravisCameras, CameraAddress
 from binpick.sim.gige import GigePair
 
@@ -182,8 +182,7 @@ def test_check_looks_at_the_host_alone_and_finds_a_camera_by_its_serial_number(g
     assert found["way to right"]["seen"] == f"{right.address} by lo"
     assert code == max(finding["exit_code"] for finding in found.values())
     assert {"receive buffer", "firewall", "clock", "processors"} <= set(found)
-    assert "ports" not in found
-    assert "cameras" not in found
+    assert not {"cell file", "publish.rest", "cameras"} & set(found)
 
 
 @pytest.mark.gige
@@ -193,6 +192,22 @@ def test_check_of_a_cell_whose_cameras_are_away_points_to_the_host(call: Call, t
     cameras = json.loads(out)[-1]
     assert (code, cameras["what"]) == (3, "cameras")
     assert cameras["command"] == f"binpick check --host --cell {tmp_path / 'cell.yaml'}"
+
+
+def test_check_looks_at_the_way_to_every_camera_and_says_why_it_cannot_search(
+        call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def search() -> None:
+        raise CameraError("Aravis is not installed")
+
+    monkeypatch.setattr(backends, "discover", search)
+    cell = CELL.format("address: 203.0.113.7", "serial: AB12")
+    (tmp_path / "cell.yaml").write_text(cell.replace("aravis,", "aravis, more: [{address: camera-3}],"))
+    code, out, _ = call("check", "--host", "--json", "--cell", str(tmp_path / "cell.yaml"))
+    found = {finding["what"]: finding for finding in json.loads(out)}
+    assert (code, found["search by serial number"]["fault"]) == (3, "Aravis is not installed")
+    assert "203.0.113.7" in found["way to left"]["seen"]
+    assert found["way to right"]["warning"].startswith("unknown")
+    assert found["way to third"]["exit_code"] == 2
 
 
 def test_check_prints_the_commands_whole_below_the_findings(call: Call, tmp_path: Path) -> None:
