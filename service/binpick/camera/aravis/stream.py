@@ -31,7 +31,6 @@ POP_MARGIN_S = 0.05
 BLOCK_IDS = 0xFFFF
 """GigE Vision 1 counts frames 1 to 65535 and again."""
 
-
 log = logging.getLogger(__name__)
 
 
