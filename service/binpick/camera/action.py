@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from binpick.camera import gvcp
 from binpick.camera.network import port_of
 
+GROUP = 1
+"""Group key and mask: the device key alone tells our cameras from others."""
 SCHEDULED = 0x80
 """The flag that announces a time behind the keys."""
 EVERYBODY = "255.255.255.255"
@@ -27,8 +29,8 @@ class Action:
     """What cameras listen for; `at_ns` is a time of their common clock, 0: at once."""
 
     device_key: int
-    group_key: int = 1
-    group_mask: int = 1
+    group_key: int = GROUP
+    group_mask: int = GROUP
     at_ns: int = 0
 
 

@@ -74,7 +74,8 @@ class Driver:
         seen = {aravis.get_device_serial_nbr(i): str(aravis.get_device_address(i)) for i in range(aravis.get_n_devices())}
         if serial not in seen:
             raise CameraNotFound(f"camera {self._name}: no camera with serial number {serial!r} answers; there are "
-                                 f"{', '.join(sorted(map(str, seen))) or 'none'}", self._name)
+                                 f"{', '.join(sorted(map(str, seen))) or 'none'}: check its power and cable, and the number in "
+                                 "the cell file", self._name)
         return seen[serial]
 
     def open(self, address: str, serial: str) -> dict[str, Any]:
