@@ -33,7 +33,7 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="Print the list a
     """
     from binpick import host
 
-    here = host.look()
+    here = host.read()
     rows = [_row(found, here) for found in _discovered()]
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
