@@ -15,6 +15,7 @@ from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.conditions import Conditions
 from binpick.sim.gige.control import Peer
 from binpick.sim.gige.device import POLL_S, Device, Identity, Surroundings
+from binpick.sim.gige.features import SIZE_PX
 from binpick.sim.gige.ledger import Entry, Ledger
 from binpick.sim.gige.pixels import Bytes
 from binpick.sim.gige.ptp import OSCILLATORS, SETTLE_S, Ptp
@@ -38,18 +39,17 @@ class GigeGroup:
     takes. `start` raises PortInUse when another program has an address's port 3956.
     """
 
-    def __init__(self, image: ImageFn, addresses: Sequence[str], size_px: tuple[int, int] = (1936, 1216),
-                 serials: Sequence[str] = (), wires: Sequence[Wire] | None = None, settle_s: float = SETTLE_S,
-                 apart: bool = False) -> None:
+    def __init__(self, image: ImageFn, addresses: Sequence[str], size_px: tuple[int, int] = SIZE_PX,
+                 serials: Sequence[str] = (), settle_s: float = SETTLE_S, apart: bool = False) -> None:
         width, height = size_px
         heads = len(addresses)
         if not 2 <= heads <= len(NAMES):
             raise ValueError(f"2 to {len(NAMES)} cameras, not {heads}")
-        names = serials or [f"SIM-{name.upper()}" for name in NAMES]
-        self.identities = tuple(Identity(index, NAMES[index], address, names[index], width, height)
+        serials = serials or [f"SIM-{name.upper()}" for name in NAMES]
+        self.identities = tuple(Identity(index, NAMES[index], address, serials[index], width, height)
                                 for index, address in enumerate(addresses))
         self.ptp = Ptp(OSCILLATORS[:heads], settle_s, apart)
-        self._wires = tuple(harness(heads) if wires is None else wires)
+        self._wires = harness(heads)
         self._timer = Timer()
         self._ledger = Ledger(heads)
         self._around = Surroundings(expose=image, projector=self._projector, began=self._carry, reset=self.reboot, ptp=self.ptp,
