@@ -366,7 +366,7 @@ def test_a_dead_camera_delays_no_verb(gige: GigePair, group: CameraGroup, clock:
 @pytest.mark.gige
 def test_a_frozen_camera_is_named_and_the_other_stays_open(gige: GigePair, group: CameraGroup) -> None:
     group.capture(LIGHT, within(3))
-    gige.freeze(0)
+    gige.change(0, sends=False)
     with pytest.raises(CameraLost, match="left took the trigger but sent no image"):
         group.capture(LIGHT, within(10))
     assert [status.connected for status in group.statuses()] == [False, True]

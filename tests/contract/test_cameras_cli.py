@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from binpick import cli, demo
-from binpick.camera import backends, controller
-from binpick.errors import CameraLost
+from binpick.camera import backends, probe
+from binpick.errors import CameraError, CameraLost
 from binpick.settings.cell import AravisCameras, CameraAddress
 from binpick.sim.gige import GigePair
 
@@ -94,7 +94,7 @@ def test_values_are_those_of_the_camera_and_grep_picks_some(gige: GigePair, call
         ["feature", "access", "value", "may", "be"], ["Width", "RO", "64", "px"],
         ["TriggerMode", "RW", "Off", "Off", "|", "On"], ["TriggerSoftware", "WO"],
         ["ExposureTime", "RW", "5000", "us", "20", "to", "10000000"]]
-    assert controller.of(address) == ""          # let go at once, so that a daemon may take it
+    assert probe.controller(address) == ""          # let go at once, so that a daemon may take it
 
 
 @pytest.mark.gige
@@ -104,7 +104,7 @@ def test_a_camera_that_another_program_controls_is_read_and_not_disturbed(gige: 
     assert code == 0
     assert "controlled by another program" in out
     assert out.splitlines()[2].split() == ["TriggerMode", "RW", "On", "Off", "|", "On"]          # as its controller has set it
-    assert controller.of(address) == "another program"
+    assert probe.controller(address) == "another program"
 
 
 @pytest.mark.gige
@@ -182,8 +182,7 @@ def test_check_looks_at_the_host_alone_and_finds_a_camera_by_its_serial_number(g
     assert found["way to right"]["seen"] == f"{right.address} by lo"
     assert code == max(finding["exit_code"] for finding in found.values())
     assert {"receive buffer", "firewall", "clock", "processors"} <= set(found)
-    assert "ports" not in found
-    assert "cameras" not in found
+    assert not {"cell file", "publish.rest", "cameras"} & set(found)
 
 
 @pytest.mark.gige
@@ -193,6 +192,22 @@ def test_check_of_a_cell_whose_cameras_are_away_points_to_the_host(call: Call, t
     cameras = json.loads(out)[-1]
     assert (code, cameras["what"]) == (3, "cameras")
     assert cameras["command"] == f"binpick check --host --cell {tmp_path / 'cell.yaml'}"
+
+
+def test_check_looks_at_the_way_to_every_camera_and_says_why_it_cannot_search(
+        call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def search() -> None:
+        raise CameraError("Aravis is not installed")
+
+    monkeypatch.setattr(backends, "discover", search)
+    cell = CELL.format("address: 203.0.113.7", "serial: AB12")
+    (tmp_path / "cell.yaml").write_text(cell.replace("aravis,", "aravis, more: [{address: camera-3}],"))
+    code, out, _ = call("check", "--host", "--json", "--cell", str(tmp_path / "cell.yaml"))
+    found = {finding["what"]: finding for finding in json.loads(out)}
+    assert (code, found["search by serial number"]["fault"]) == (3, "Aravis is not installed")
+    assert "203.0.113.7" in found["way to left"]["seen"]
+    assert found["way to right"]["warning"].startswith("unknown")
+    assert found["way to third"]["exit_code"] == 2
 
 
 def test_check_prints_the_commands_whole_below_the_findings(call: Call, tmp_path: Path) -> None:

@@ -298,10 +298,10 @@ def test_both_killed_in_mid_exposure_over_rest_and_back(tmp_path: Path, gige: Gi
         cell.wait(cell.ready, "ready again")
         assert cell.health()["reasons"] == []
         assert cell.cycle().status_code == 200
-        gige.unplug(0)
+        gige.change(0, plugged=False)
         assert cell.wait(lambda: not cell.ready(), "noticed though idle") < 3
         assert camera_reasons(cell)[0].startswith("camera left is down: "), cell.health()
-        gige.plug(0)
+        gige.change(0, plugged=True)
         assert cell.wait(cell.ready, "ready once more") < 10
         assert cell.cycle().status_code == 200
         ends_well(cell)

@@ -53,7 +53,7 @@ def test_answers_to_an_action_command(reply: str, status: int | None) -> None:
 
 
 def test_nobody_answers_an_action_command_here() -> None:
-    said = action.broadcast(Action(1), 1, ("127.0.251.2",), target="127.0.251.2")
+    said = action.broadcast(Action(1), ("127.0.251.2",), target="127.0.251.2")
     assert said == {"127.0.251.2": "it did not acknowledge"}
 
 

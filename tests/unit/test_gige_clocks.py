@@ -117,6 +117,19 @@ def test_a_follower_may_be_off_without_knowing_and_resets_only_when_it_is_free()
     assert network.ptp.clock(2, network.zero + 2500 * MS).at(network.zero + 3500 * MS) == SECOND
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_what_was_done_to_a_head_can_be_ended(apart: bool) -> None:
+    network, well = Network(apart), Network(apart)
+    for one in (network, well):
+        one.enable(0, 0, 1)
+    network.ptp.force(1, "Faulty", network.zero + 100 * MS)
+    network.ptp.move(1, 1 - apart, network.zero + 100 * MS)
+    network.ptp.stray(1, 70_000, network.zero + 100 * MS)
+    network.ptp.mend(1, network.zero + 200 * MS)
+    assert network.states(2000) == well.states(2000)
+    assert network.offsets_ns(2000) == well.offsets_ns(2000)
+
+
 def test_power_ends_it_and_a_tuned_clock_stays_so() -> None:
     network = Network()
     network.enable(0, 0, 1)

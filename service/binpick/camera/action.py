@@ -11,14 +11,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+from binpick.camera import gvcp
 from binpick.camera.network import port_of
-from binpick.camera.probe import PORT
 
-ACTION_CMD, ACTION_ACK = 0x0100, 0x0101
-KEY = 0x42
-ACKNOWLEDGE, SCHEDULED = 0x01, 0x80
-HEADER = struct.Struct(">BBHHH")
-REPLY = struct.Struct(">HHHH")
+GROUP = 1
+"""Group key and mask: the device key alone tells our cameras from others."""
+SCHEDULED = 0x80
+"""The flag that announces a time behind the keys."""
 EVERYBODY = "255.255.255.255"
 STATUSES = {0x8013: "it has no PTP time", 0x8014: "it has too many actions waiting", 0x8016: "it came late"}
 TRIES = 3
@@ -30,40 +29,38 @@ class Action:
     """What cameras listen for; `at_ns` is a time of their common clock, 0: at once."""
 
     device_key: int
-    group_key: int = 1
-    group_mask: int = 1
+    group_key: int = GROUP
+    group_mask: int = GROUP
     at_ns: int = 0
 
 
 def datagram(action: Action, number: int) -> bytes:
-    """The command, to be acknowledged; `number` 1 to 65535 is its request id."""
-    payload = struct.pack(">III", action.device_key, action.group_key, action.group_mask)
-    flags = ACKNOWLEDGE
-    if action.at_ns:
-        payload, flags = payload + struct.pack(">Q", action.at_ns), flags | SCHEDULED
-    return HEADER.pack(KEY, flags, ACTION_CMD, len(payload), number) + payload
+    """The command, to be acknowledged."""
+    keys = struct.pack(">III", action.device_key, action.group_key, action.group_mask)
+    if not action.at_ns:
+        return gvcp.command(gvcp.ACTION, number, keys)
+    return gvcp.command(gvcp.ACTION, number, keys + struct.pack(">Q", action.at_ns), SCHEDULED)
 
 
 def answer(reply: bytes, number: int) -> int | None:
     """The status in an acknowledge of that command, 0 when it was accepted; None for any other datagram."""
-    if len(reply) < REPLY.size:
-        return None
-    status, command, _length, request = REPLY.unpack_from(reply)
-    return status if command == ACTION_ACK and request == number else None
+    said = gvcp.reply(reply, gvcp.ACTION)
+    return said.status if said is not None and said.number == number else None
 
 
-def broadcast(action: Action, number: int, addresses: tuple[str, ...], target: str = EVERYBODY) -> dict[str, str]:
+def broadcast(action: Action, addresses: tuple[str, ...], target: str = EVERYBODY) -> dict[str, str]:
     """Sends it out of every port that cameras hang on; why each camera did not accept it, "" when it did.
 
     Waits until all have answered, at most 3 times 0.05 s.
     """
+    number = gvcp.number()
     command, said = datagram(action, number), dict.fromkeys(addresses, "it did not acknowledge")
     with ExitStack() as stack:
         sockets = [stack.enter_context(_socket(port)) for port in dict.fromkeys(map(port_of, addresses))]
         open_ = set(addresses)
         for _ in range(TRIES):
             for out in sockets:
-                out.sendto(command, (target, PORT))
+                out.sendto(command, (target, gvcp.PORT))
             for address, status in _replies(sockets, number, open_):
                 said[address] = STATUSES.get(status, f"status 0x{status:04x}") if status else ""
                 open_.discard(address)

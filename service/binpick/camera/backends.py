@@ -3,7 +3,7 @@
 from binpick.camera import sync
 from binpick.camera.aravis import AravisCamera, Setup
 from binpick.camera.aravis.inventory import describe, discover, version
-from binpick.camera.base import Camera
+from binpick.camera.base import NAMES, Camera
 from binpick.camera.files import FileCamera
 from binpick.camera.group import CameraGroup
 from binpick.camera.need import needs
@@ -11,9 +11,7 @@ from binpick.camera.starter import Starter
 from binpick.settings.cell import AravisCameras, FileCameras
 from binpick.settings.recipe import Recipe
 
-__all__ = ["NAMES", "describe", "discover", "group", "make", "version"]
-
-NAMES = ("left", "right", "third", "fourth", "fifth")
+__all__ = ["describe", "discover", "group", "make", "version"]
 
 
 def make(settings: AravisCameras | FileCameras, recipes: tuple[Recipe, ...] = ()) -> tuple[Camera, ...]:

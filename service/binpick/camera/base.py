@@ -8,6 +8,8 @@ from binpick.data import CameraStatus, Frame, Light
 
 MonotonicNs: TypeAlias = int
 Clock: TypeAlias = Callable[[], MonotonicNs]
+NAMES = ("left", "right", "third", "fourth", "fifth")
+"""Of a rig's cameras, in its order."""
 
 
 @runtime_checkable
@@ -21,7 +23,7 @@ class Camera(Protocol):
 
     @property
     def name(self) -> str:
-        """"left", "right", "third", ...; named in every error."""
+        """One of NAMES; named in every error."""
         ...
 
     def open(self, deadline_ns: MonotonicNs) -> None:

@@ -110,7 +110,8 @@ class CameraGroup:
         left, right, *more = frames
         for other in (right, *more):
             if other.image.shape != left.image.shape:
-                raise PairRefused(f"the images differ in size: left {_size(left)}, {other.camera} {_size(other)} pixels")
+                raise PairRefused(f"the images differ in size: left {_size(left)}, {other.camera} {_size(other)} pixels: "
+                                  "set the cameras to the size that the rig was calibrated with")
         skew = self._judge(frames)
         return StereoPair(left=left, right=right, captured_at=captured_at, skew_us=skew.us,
                           sigma_us=skew.sigma_us if math.isfinite(skew.sigma_us) else 0.0, proof=skew.proof, more=tuple(more))
@@ -210,7 +211,8 @@ class CameraGroup:
 
     def _check(self, frame: Frame) -> None:
         if frame.missing:
-            raise PairRefused(f"camera {frame.camera}: {frame.missing} packets of the image are missing", frame.camera)
+            raise PairRefused(f"camera {frame.camera}: {frame.missing} packets of the image are missing: check cable, network "
+                              "card and socket buffer", frame.camera)
         if frame.sequence != self._sequence or frame.triggered_ns < self._started_ns:
             raise PairRefused(f"camera {frame.camera}: the image is older than its trigger", frame.camera)
         if wrong := proof.misdated(frame):

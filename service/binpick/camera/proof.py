@@ -1,6 +1,7 @@
 """What proves that images show one instant: PTP, else clocks compared by latches, else the host's own times, else nothing."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -25,6 +26,11 @@ class Skew:
     def worst_us(self) -> float:
         """What it may be at 3 sigma."""
         return abs(self.us) + 3 * self.sigma_us
+
+
+def together(states: Sequence[str]) -> bool:
+    """Whether cameras in these PTP states follow one clock: two that do not hear each other both call themselves master."""
+    return "Slave" in states and set(states) <= set(SYNCHRONISED) and states.count("Master") <= 1
 
 
 def skew(first: Frame, second: Frame) -> Skew:
@@ -53,9 +59,7 @@ def misdated(frame: Frame) -> str:
 
 
 def _ptp(first: Frame, second: Frame) -> Skew | None:
-    """None unless both cameras follow one clock: two that do not hear each other both call themselves master."""
-    roles = sorted((first.ptp, second.ptp))
-    if roles not in (["Master", "Slave"], ["Slave", "Slave"]):
+    if not together((first.ptp, second.ptp)):
         return None
     sigma_us = math.hypot(CLOCK_SIGMA_US, first.ptp_offset_ns / 1000, second.ptp_offset_ns / 1000)
     return Skew((second.timestamp_ns - first.timestamp_ns) / 1000, sigma_us, "ptp")

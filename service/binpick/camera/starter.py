@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 
-from binpick.camera import action
+from binpick.camera import action, proof
 from binpick.camera.action import Action
 from binpick.camera.base import Camera, Clock
 from binpick.data import CameraStatus
@@ -12,7 +11,6 @@ from binpick.settings.cell import Sync
 
 LEAD_NS = 8_000_000
 """From sending a scheduled action to its time: longer than a busy host takes to send it."""
-_numbers = count(1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +31,7 @@ class Starter:
     def unready(self, statuses: Sequence[CameraStatus]) -> str:
         """Why no shot can be started, "" when one can: a time for all means nothing without PTP."""
         states = [status.ptp for status in statuses]
-        if self.sync != "scheduled_action" or (states.count("Master") <= 1 and set(states) in ({"Master", "Slave"}, {"Slave"})):
+        if self.sync != "scheduled_action" or proof.together(states):
             return ""
         said = ", ".join(f"{status.name} {status.ptp or 'without PTP'}" for status in statuses)
         return f"the cameras' clocks do not keep together by PTP ({said}): are they on one switch?"
@@ -50,7 +48,7 @@ class Starter:
             at_ns = max(times)
         names = {camera.status().address: camera.name for camera in cameras}
         try:
-            said = action.broadcast(Action(self.device_key, at_ns=at_ns), (next(_numbers) - 1) % 0xFFFF + 1, tuple(names))
+            said = action.broadcast(Action(self.device_key, at_ns=at_ns), tuple(names))
         except OSError as error:
             return f"the action command cannot be sent ({error.strerror or error}): check this host's network"
         return "; ".join(f"camera {names[address]} did not take the action command: {why}"

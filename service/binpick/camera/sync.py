@@ -3,6 +3,7 @@
 import zlib
 from dataclasses import dataclass
 
+from binpick.camera.action import GROUP
 from binpick.settings.cell import AravisCameras
 
 
@@ -19,8 +20,6 @@ class Step:
 
 PROJECTOR_LINE = "Line2"
 """The Alvium's opto-isolated output, which strobes the projector."""
-GROUP = 1
-"""The action's group key and mask: the device key alone tells our cameras from others."""
 
 
 def device_key(cameras: AravisCameras) -> int:

@@ -33,7 +33,7 @@ def list_(as_json: Annotated[bool, typer.Option("--json", help="Print the list a
     """
     from binpick import host
 
-    here = host.look()
+    here = host.read()
     rows = [_row(found, here) for found in _discovered()]
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
@@ -46,11 +46,13 @@ def values(address: Address = "",
            grep: Annotated[str, typer.Option(help="Only features whose name matches this regular expression, "
                                                   "in either case.")] = "") -> None:
     """What every feature is set to, its unit, what may be written to it, and whether it may be."""
+    from binpick.camera import backends
+
     try:
         wanted = re.compile(grep, re.IGNORECASE)
     except re.error as error:
         raise InputError(f"--grep {grep!r} is no regular expression: {error}") from error
-    for description in _described(_addresses(address)):
+    for description in map(backends.describe, _addresses(address)):
         who = (description.value("DeviceModelName"), description.value("DeviceSerialNumber"), f"at {description.address}")
         held = ", controlled by another program" if description.controlled else ""
         typer.echo(" ".join(word for word in who if word) + held)
@@ -66,6 +68,7 @@ def dump(address: Address = "",
     It holds serial numbers, network addresses and no images. Exit code 3: a camera could not be read; the file says which.
     """
     from binpick import host
+    from binpick.camera import backends
 
     addresses = _addresses(address)
     path = out or Path(f"binpick-cameras-{datetime.now(UTC):%Y%m%d-%H%M%S}.zip")
@@ -76,7 +79,7 @@ def dump(address: Address = "",
     for number, one in enumerate(addresses, start=1):
         typer.echo(f"{number} of {len(addresses)}: reading {one} ...", err=True)
         try:
-            (description,) = _described([one])
+            description = backends.describe(one)
         except CameraError as error:
             failed.append(one)
             files[f"{one}/error.txt"] = f"{error}\n"
@@ -104,17 +107,10 @@ def _addresses(address: str) -> list[str]:
     return [address] if address else [found.address for found in _discovered()]
 
 
-def _described(addresses: Iterable[str]) -> "Iterator[Description]":
-    from binpick.camera import backends
-
-    for address in addresses:
-        yield backends.describe(address)
-
-
 def _row(found: "Found", here: "Host") -> dict[str, str]:
-    from binpick.camera import controller
+    from binpick.camera import probe
 
-    way, held_by = here.way(found.address), controller.of(found.address)
+    way, held_by = here.way(found.address), probe.controller(found.address)
     port = "" if way is None or way.gateway else way.port
     if held_by is None:
         control = "out of reach: another subnet?" if not port else "does not answer"

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -90,13 +90,21 @@ def findings(path: Path) -> Iterator[Finding]:
 def _of_host(path: Path) -> Iterator[Finding]:
     """The machine, as the cameras of this cell file need it. Raises SettingsError."""
     from binpick import host, settings
+    from binpick.camera.base import NAMES
+    from binpick.errors import CameraError
 
     cell = settings.load(path)
     cameras, packet_size = cell.cameras, 0
     places: list[tuple[str, str]] = []
     if cameras.backend == "aravis":
         packet_size = 0 if cameras.packet_size == "auto" else cameras.packet_size
-        places = [("left", _address(cameras.left)), ("right", _address(cameras.right))]
+        known = (cameras.left, cameras.right, *cameras.more)
+        try:
+            addresses = _addresses(known)
+        except CameraError as error:       # no driver to search with; the machine can be looked at nevertheless
+            addresses = [camera.address for camera in known]
+            yield Finding("search by serial number", "", str(error), error.exit_code)
+        places = list(zip(NAMES, addresses, strict=False))
     for finding in host.judge(host.look(), places, packet_size):
         first = "unknown" if finding.level == "unknown" else ""
         told = ": ".join(part for part in (first, finding.seen, finding.reason) if part)
@@ -105,17 +113,13 @@ def _of_host(path: Path) -> Iterator[Finding]:
                       "" if fails or well else told, finding.command)
 
 
-def _address(camera: "CameraAddress") -> str:
-    """Where it is; one that is known by its serial number alone is searched. Empty: it does not answer."""
+def _addresses(cameras: "Sequence[CameraAddress]") -> list[str]:
+    """Where they are; those known by their serial number alone are searched. Empty: it does not answer. Raises CameraError."""
     from binpick.camera import backends
-    from binpick.errors import CameraError
 
-    if camera.address:
-        return camera.address
-    try:
-        return next((found.address for found in backends.discover() if found.serial == camera.serial), "")
-    except CameraError:
-        return ""
+    found = () if all(camera.address for camera in cameras) else backends.discover()
+    by_serial = {camera.serial: camera.address for camera in found}
+    return [camera.address or by_serial.get(camera.serial, "") for camera in cameras]
 
 
 def _numbers(items: "Iterable[Bin | Tool | Recipe]") -> str:

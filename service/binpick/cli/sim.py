@@ -34,8 +34,7 @@ def sim(
     if out is not None:
         _run(out, world, seed, _addresses(at, heads), numbered, wanted)
         return
-    states = door.ask(at)
-    for text in wanted:
+    for text in wanted or [""]:
         states = door.ask(at, text)
     for state in states:
         typer.echo(json.dumps(state))

@@ -4,12 +4,11 @@ import time
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
-from binpick.camera.base import Clock, MonotonicNs, remaining_s
+from binpick.camera.base import NAMES, Clock, MonotonicNs, remaining_s
 from binpick.data import CameraStatus, Frame, Image, Light
 from binpick.errors import CameraLost
 
 Expose: TypeAlias = Callable[[int, Light, int], Image]
-NAMES = ("left", "right", "third", "fourth", "fifth")
 # how often a stuck or exposing camera looks at its fault
 TICK_S = 0.02
 
@@ -33,7 +32,7 @@ class SimCamera:
 
     @property
     def name(self) -> str:
-        """"left", "right", "third", ..."""
+        """One of NAMES."""
         return NAMES[self._index]
 
     def open(self, deadline_ns: MonotonicNs) -> None:

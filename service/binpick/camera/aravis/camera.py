@@ -53,42 +53,35 @@ class AravisCamera:
         driver = Driver(self._name, self._setup)
         self._driver = driver
         self._owner = Owner(f"binpick-cam-{self._name}", driver.close, driver.rest, lambda: driver.due_ns)
-        address = self._address or self._do("searching it", lambda: driver.find(self._serial), deadline_ns)
-        facts = self._do("opening", lambda: driver.open(address, self._serial), deadline_ns)
+        address = self._address or self._do("searching it", lambda driver: driver.find(self._serial), deadline_ns)
+        facts = self._do("opening", lambda driver: driver.open(address, self._serial), deadline_ns)
         self._status = replace(self._status, connected=True, error="", address=address, **facts)
         self._away = False
-        if self._link is None:
-            self._link = Link(address)
-        self._link.forget()
+        self._link = Link(address)
 
     def configure(self, light: Light, deadline_ns: MonotonicNs) -> None:
         """Exposure, gain, and whether the line that strobes the projector does so."""
-        driver = self._opened()
-        self._do("setting exposure and gain", lambda: driver.configure(light), deadline_ns)
+        self._do("setting exposure and gain", lambda driver: driver.configure(light), deadline_ns)
 
     def trigger(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002 - the frame's own affair in grab
         """One software trigger."""
-        driver = self._opened()
-        self._do("triggering", driver.trigger, deadline_ns)
+        self._do("triggering", Driver.trigger, deadline_ns)
 
     def arm(self, sequence: int, deadline_ns: MonotonicNs) -> None:  # noqa: ARG002
         """Makes room for an image that something else will start."""
-        driver = self._opened()
-        self._do("preparing", driver.arm, deadline_ns)
+        self._do("preparing", Driver.arm, deadline_ns)
 
     def disarm(self, deadline_ns: MonotonicNs) -> None:
         """The image may come, or not."""
-        driver = self._opened()
-        self._do("waiting", driver.disarm, deadline_ns)
+        self._do("waiting", Driver.disarm, deadline_ns)
 
     def device_ns(self, host_ns: MonotonicNs) -> int | None:
         """By the latches so far."""
-        return self._opened().clock.device_ns(host_ns)
+        return self._driver.clock.device_ns(host_ns) if self._driver is not None else None
 
     def grab(self, sequence: int, deadline_ns: MonotonicNs) -> Frame:
         """The frame of that trigger. Raises CameraLost when none comes, PairRefused when packets stayed away."""
-        driver = self._opened()
-        frame = self._do("waiting for its image", lambda: driver.grab(sequence, deadline_ns), deadline_ns)
+        frame = self._do("waiting for its image", lambda driver: driver.grab(sequence, deadline_ns), deadline_ns)
         status = self._status
         self._status = replace(status, frames=status.frames + 1, resends=status.resends + frame.resends)
         return frame
@@ -135,16 +128,12 @@ class AravisCamera:
         state, offset_ns = driver.ptp
         return replace(self._status, ptp=state, ptp_offset_us=round(offset_ns / 1000, 1))
 
-    def _opened(self) -> Driver:
-        if self._driver is None:
-            raise CameraLost(f"camera {self._name} is not open", self._name)
-        return self._driver
-
-    def _do(self, what: str, function: Callable[[], T], deadline_ns: MonotonicNs) -> T:
-        if self._owner is None:
+    def _do(self, what: str, verb: Callable[[Driver], T], deadline_ns: MonotonicNs) -> T:
+        driver = self._driver
+        if self._owner is None or driver is None:
             raise CameraLost(f"camera {self._name} is not open", self._name)
         try:
-            return self._owner.call(function, deadline_ns)
+            return self._owner.call(lambda: verb(driver), deadline_ns)
         except TimeoutError:
             raise self._fail(CameraLost(f"camera {self._name} stopped answering while {what}: check its power, cable and "
                                         "network", self._name)) from None

@@ -57,7 +57,7 @@ class Driver:
         self._name = name
         self._setup = setup
         self._camera: Any = None
-        self._features: Any = None
+        self._features: Features | None = None
         self._stream: Stream | None = None
         self._time: Timekeeper | None = None
         self._exposure_us = self._gain_db = 0.0
@@ -74,7 +74,8 @@ class Driver:
         seen = {aravis.get_device_serial_nbr(i): str(aravis.get_device_address(i)) for i in range(aravis.get_n_devices())}
         if serial not in seen:
             raise CameraNotFound(f"camera {self._name}: no camera with serial number {serial!r} answers; there are "
-                                 f"{', '.join(sorted(map(str, seen))) or 'none'}", self._name)
+                                 f"{', '.join(sorted(map(str, seen))) or 'none'}: check its power and cable, and the number in "
+                                 "the cell file", self._name)
         return seen[serial]
 
     def open(self, address: str, serial: str) -> dict[str, Any]:
@@ -92,7 +93,7 @@ class Driver:
             features = self._features = Features(camera, self._name)
             camera.stop_acquisition()                     # a controller that died may have left it running
             features.apply(self._setup.steps)
-            packet_size = self._fit_packets(address)
+            packet_size = self._fit_packets(camera, features, address)
             camera.gv_set_stream_options(aravis.GvStreamOption.PACKET_SOCKET_DISABLED)
             self._stream = Stream(camera, self._name, self._setup.pixel_format)
             self._time = Timekeeper(camera, features)
@@ -112,17 +113,17 @@ class Driver:
                 raise CameraError(f"camera {self._name}: {need.setting} is {need.value:g}, but this camera's range is {low:g} "
                                   f"to {high:g}: change the cell file", self._name)
 
-    def _fit_packets(self, address: str) -> int:
-        """Their size, and the pause between them when cameras share a port."""
-        camera, size = self._camera, self._setup.packet_size
+    def _fit_packets(self, camera: Any, features: Features, address: str) -> int:
+        """Their size in bytes, and the pause between them when cameras share a port."""
+        size = self._setup.packet_size
         if size == "auto":
             camera.gv_auto_packet_size()
         else:
             camera.gv_set_packet_size(size)
         size = int(camera.gv_get_packet_size())
         cameras = network.sharing(address, self._setup.neighbours)
-        speed = int(camera.get_integer("DeviceLinkSpeed")) if self._features.has("DeviceLinkSpeed") else 0
-        if self._features.has("GevSCPD"):
+        speed = int(camera.get_integer("DeviceLinkSpeed")) if features.has("DeviceLinkSpeed") else 0
+        if features.has("GevSCPD"):
             camera.gv_set_packet_delay(network.packet_delay_ns(size, cameras, speed or network.GIGABIT))
         return size
 
@@ -153,6 +154,7 @@ class Driver:
     def configure(self, light: Light) -> None:
         """Writes what the light asks for. Raises CameraError when the camera makes something else of it."""
         assert self._stream is not None
+        assert self._features is not None
         with self._translating("setting exposure and gain"):
             apart_us = light.exposure_us * EXPOSURE_TOLERANCE
             self._exposure_us = self._features.approach("ExposureTime", light.exposure_us, apart_us)

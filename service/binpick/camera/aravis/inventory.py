@@ -2,6 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Iterator
+from ipaddress import IPv4Address
 from typing import Any
 
 from binpick.camera import probe
@@ -43,7 +44,7 @@ def discover() -> tuple[Found, ...]:
                                                          aravis.get_device_model, aravis.get_device_vendor,
                                                          aravis.get_device_physical_id)))
              for index in range(aravis.get_n_devices()) if aravis.get_device_protocol(index) == "GigEVision")
-    return tuple(sorted(found, key=lambda camera: tuple(int(part) for part in camera.address.split("."))))
+    return tuple(sorted(found, key=lambda camera: IPv4Address(camera.address)))
 
 
 def describe(address: str) -> Description:

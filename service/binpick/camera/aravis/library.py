@@ -29,5 +29,6 @@ def translated(error: Any, name: str, doing: str) -> CameraError:
     if "device" not in error.domain or error.code in (
             kind.FEATURE_NOT_FOUND, kind.WRONG_FEATURE, kind.INVALID_PARAMETER, kind.PROTOCOL_ERROR_INVALID_PARAMETER,
             kind.PROTOCOL_ERROR_WRITE_PROTECT, kind.PROTOCOL_ERROR_INVALID_ADDRESS, kind.PROTOCOL_ERROR_NOT_IMPLEMENTED):
-        return CameraError(f"camera {name} does not accept {doing}: {error.message}", name)
+        return CameraError(f"camera {name} does not accept {doing} ({error.message}): check the cell file, and the camera's "
+                           "model and firmware", name)
     return CameraLost(f"camera {name} failed while {doing} ({error.message}): check its power, cable and network", name)

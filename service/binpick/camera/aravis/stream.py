@@ -31,7 +31,6 @@ POP_MARGIN_S = 0.05
 BLOCK_IDS = 0xFFFF
 """GigE Vision 1 counts frames 1 to 65535 and again."""
 
-
 log = logging.getLogger(__name__)
 
 
@@ -114,11 +113,12 @@ class Stream:
         """Its pixels in 8-bit grey, copied once. Raises CameraError when it is not what the camera was told to send."""
         aravis, _ = library.load()
         if buffer.get_payload_type() != aravis.BufferPayloadType.IMAGE:
-            raise CameraError(f"camera {self._name}: it sent {buffer.get_payload_type().value_nick}, not an image", self._name)
+            raise CameraError(f"camera {self._name}: it sent {buffer.get_payload_type().value_nick}, not an image: check its "
+                              "model and firmware", self._name)
         width, height = size = buffer.get_image_width(), buffer.get_image_height()
         if size != self._size:
             raise CameraError(f"camera {self._name}: the image has {width}x{height} pixels, not "
-                              f"{self._size[0]}x{self._size[1]}", self._name)
+                              f"{self._size[0]}x{self._size[1]}: it is opened again", self._name)
         try:
             return pixels.grey(buffer.get_data(), buffer.get_image_pixel_format(), self._format, width, height)
         except PairRefused as refusal:

@@ -11,7 +11,8 @@ LINK_MBPS = 2000.0
 @dataclass(frozen=True, slots=True)
 class Conditions:
     """Without arguments: none. `skew_us` is how much later than triggered it exposes; `pixel_format` is what it sends whatever
-    it was told; packets larger than `mtu` (bytes with all headers) are lost; `answers` and `sends` fall when it hangs."""
+    it was told; packets larger than `mtu` (bytes with all headers) are lost; `answers` and `sends` fall when it hangs. Without
+    its network cable (`plugged`) it keeps power and settings, and feels its lines, unless that wire (`wired`) is broken."""
 
     transit: Transit = field(default_factory=Transit)
     seed: int = 0
@@ -24,6 +25,16 @@ class Conditions:
     sends: bool = True
     early_leader: bool = False
     pixel_format: str = ""
+
+    @property
+    def reachable(self) -> bool:
+        """Whether the network finds it."""
+        return self.plugged and self.answers
+
+    @property
+    def streams(self) -> bool:
+        """Whether its images leave."""
+        return self.reachable and self.sends
 
     def rebooted(self) -> "Conditions":
         """Without those that a power cycle ends."""

@@ -78,7 +78,7 @@ class Device:
         """These hold from now on."""
         before, self.conditions = self.conditions, conditions
         self.stream.sender.mtu = conditions.mtu
-        self.stream.sender.silent = not (conditions.plugged and conditions.answers and conditions.sends)
+        self.stream.sender.silent = not conditions.streams
         if (before.transit, before.seed) != (conditions.transit, conditions.seed):     # else chance goes on as it was
             self.stream.sender.disturb(conditions.transit, conditions.seed + self.identity.index)
 
@@ -123,7 +123,7 @@ class Device:
 
     def receive(self, datagram: bytes, peer: Peer, arrived_ns: int) -> None:
         """Answers one datagram, unless its cable is out or it hangs."""
-        if not (self.conditions.plugged and self.conditions.answers):
+        if not self.conditions.reachable:
             return
         self._look_at_ptp(arrived_ns)
         reply = self.control.answer(datagram, peer, arrived_ns)

@@ -1,14 +1,15 @@
 """Faults by name: what can be done to simulated cameras in words such as `loss=0.05@left`, from tests and from a shell."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from binpick.camera.base import NAMES
 from binpick.errors import InputError
 from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.conditions import Conditions
 from binpick.sim.gige.features import PTP_STATES
-from binpick.sim.gige.group import NAMES, REBOOT_S, GigeGroup
+from binpick.sim.gige.group import REBOOT_S, GigeGroup
 from binpick.sim.gige.pixels import FORMATS
 
 Deed = Callable[[GigeGroup, int, Any], None]
@@ -88,9 +89,9 @@ def _power(group: GigeGroup, head: int, on: bool) -> None:
 
 def _clear(group: GigeGroup, head: int, _value: Any) -> None:
     _power(group, head, True)
-    group.change(head, **{name: getattr(Conditions(), name) for name in Conditions.__dataclass_fields__})
-    group.ptp.force(head, "", host_ns())
-    group.ptp.move(head, 0, host_ns())
+    well = Conditions()
+    group.change(head, **{field.name: getattr(well, field.name) for field in fields(well)})
+    group.ptp.mend(head, host_ns())
     if group.stolen(head):
         group.steal(head, False)
 

@@ -16,6 +16,8 @@ MONO8 = FORMATS["Mono8"]
 FIRMWARE = "binpick-sim 1.0"
 VENDOR = "Allied Vision"
 MODEL = "Alvium G1-240m"
+SIZE_PX = (1936, 1216)
+"""Width and height of its sensor."""
 LINES = 4
 LINK_BYTES_PER_S = 125_000_000
 GVSP_OVERHEAD = 36

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import TracebackType
 from typing import TypeAlias
 
+from binpick.camera.base import NAMES
 from binpick.data import Image, Light
 from binpick.errors import PortInUse
 from binpick.sim.gige import channel, gvcp
@@ -14,6 +15,7 @@ from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.conditions import Conditions
 from binpick.sim.gige.control import Peer
 from binpick.sim.gige.device import POLL_S, Device, Identity, Surroundings
+from binpick.sim.gige.features import SIZE_PX
 from binpick.sim.gige.ledger import Entry, Ledger
 from binpick.sim.gige.pixels import Bytes
 from binpick.sim.gige.ptp import OSCILLATORS, SETTLE_S, Ptp
@@ -23,7 +25,6 @@ from binpick.sim.gige.wiring import Edge, Wire, harness, pulse
 
 ImageFn: TypeAlias = Callable[[int, Light, int], Image]
 """(camera index, light, shot number) -> the image; called at the exposure's end on that camera's thread."""
-NAMES = ("left", "right", "third", "fourth", "fifth")
 THIEF: Peer = ("203.0.113.1", 1)
 """Nobody: an address that is reserved for documentation (RFC 5737)."""
 REBOOT_S = 1.0
@@ -38,21 +39,20 @@ class GigeGroup:
     takes. `start` raises PortInUse when another program has an address's port 3956.
     """
 
-    def __init__(self, image: ImageFn, addresses: Sequence[str], size_px: tuple[int, int] = (1936, 1216),
-                 serials: Sequence[str] = (), wires: Sequence[Wire] | None = None, settle_s: float = SETTLE_S,
-                 apart: bool = False) -> None:
+    def __init__(self, image: ImageFn, addresses: Sequence[str], size_px: tuple[int, int] = SIZE_PX,
+                 serials: Sequence[str] = (), settle_s: float = SETTLE_S, apart: bool = False) -> None:
         width, height = size_px
         heads = len(addresses)
         if not 2 <= heads <= len(NAMES):
             raise ValueError(f"2 to {len(NAMES)} cameras, not {heads}")
-        names = serials or [f"SIM-{name.upper()}" for name in NAMES]
-        self.identities = tuple(Identity(index, NAMES[index], address, names[index], width, height)
+        serials = serials or [f"SIM-{name.upper()}" for name in NAMES]
+        self.identities = tuple(Identity(index, NAMES[index], address, serials[index], width, height)
                                 for index, address in enumerate(addresses))
         self.ptp = Ptp(OSCILLATORS[:heads], settle_s, apart)
-        self._wires = tuple(harness(heads) if wires is None else wires)
+        self._wires = harness(heads)
         self._timer = Timer()
         self._ledger = Ledger(heads)
-        self._around = Surroundings(expose=image, projector=self._projector, began=self._carry, reset=self._reset, ptp=self.ptp,
+        self._around = Surroundings(expose=image, projector=self._projector, began=self._carry, reset=self.reboot, ptp=self.ptp,
                                     timer=self._timer, ledger=self._ledger)
         self._devices: dict[int, Device] = {}
         self._conditions = [Conditions()] * heads
@@ -126,22 +126,6 @@ class GigeGroup:
         self._timer.call(host_ns(), lambda: self.kill(index))
         self._timer.call(host_ns() + int(after_s * 1e9), lambda: self._revive(index))
 
-    def freeze(self, index: int, answers: bool = True) -> None:
-        """Its images stay away; unless it `answers`, commands and triggers find nobody either. `thaw` or `restart` ends it."""
-        self.change(index, sends=False, answers=answers)
-
-    def thaw(self, index: int) -> None:
-        """It goes on as if nothing had been."""
-        self.change(index, sends=True, answers=True)
-
-    def unplug(self, index: int) -> None:
-        """Its network cable is out; it keeps its power and its settings, and feels its lines."""
-        self.change(index, plugged=False)
-
-    def plug(self, index: int) -> None:
-        """The cable is in again."""
-        self.change(index, plugged=True)
-
     def misfire(self, index: int) -> None:
         """It exposes once without having been asked."""
         self._devices[index].trigger(host_ns())
@@ -167,7 +151,7 @@ class GigeGroup:
 
     def _meet(self, index: int, conditions: Conditions) -> None:
         self._conditions[index] = conditions
-        self.ptp.cut(index, not (conditions.plugged and conditions.answers), host_ns())
+        self.ptp.cut(index, not conditions.reachable, host_ns())
         if index in self._devices:
             self._devices[index].meet(conditions)
 
@@ -218,9 +202,6 @@ class GigeGroup:
             feel()
         else:
             self._timer.call(edge.at_ns, feel)
-
-    def _reset(self, index: int) -> None:
-        self.reboot(index)
 
     def _revive(self, index: int) -> None:
         if not self._stop.is_set():

@@ -20,7 +20,6 @@ from binpick.sim.gige.transit import Indices, Transit
 HEADER = 8
 LEADER, TRAILER, PAYLOAD = 1, 2, 3
 IMAGE = 1
-MAX_BLOCK = 0xFFFF
 KEPT_BLOCKS = 4
 UDP_SEGMENT = 103
 """The socket option of linux/udp.h, which Python does not name."""

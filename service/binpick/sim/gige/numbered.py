@@ -3,6 +3,7 @@
 import numpy as np
 
 from binpick.data import Image, Light
+from binpick.sim.gige.features import SIZE_PX
 
 HEAD_BITS, SHOT_BITS, CHECK_BITS = 4, 32, 12
 FIELDS = HEAD_BITS + SHOT_BITS + CHECK_BITS
@@ -14,7 +15,7 @@ MODULUS = 4093
 class Numbered:
     """An image source of a group: a texture of each head's own, with a row of black and white squares at the upper left."""
 
-    def __init__(self, heads: int, size_px: tuple[int, int] = (1936, 1216)) -> None:
+    def __init__(self, heads: int, size_px: tuple[int, int] = SIZE_PX) -> None:
         """Raises ValueError when the image is too narrow for the squares."""
         width, height = size_px
         self._side = min(MAX_SIDE, width // FIELDS)

@@ -48,6 +48,7 @@ class Ptp:
         """`apart`: each head is on a network of its own and hears nobody."""
         self._oscillators = oscillators
         self._settle_ns = int(settle_s * 1e9)
+        self._apart = apart
         self._lock = threading.Lock()
         self._ports = [Port(Clock(0, 0), segment=index * apart, residual_ns=index * RESIDUAL_NS)
                        for index in range(len(oscillators))]
@@ -92,6 +93,11 @@ class Ptp:
     def stray(self, index: int, residual_ns: int, now_ns: int) -> None:
         """As a follower it is off by that much, and believes it is not."""
         self._change(index, now_ns, residual_ns=residual_ns)
+
+    def mend(self, index: int, now_ns: int) -> None:
+        """Ends what was forced, moved or strayed."""
+        self.force(index, "", now_ns)
+        self._change(index, now_ns, segment=index * self._apart, residual_ns=index * RESIDUAL_NS)
 
     def reset(self, index: int, now_ns: int) -> None:
         """Its clock begins again at 0, unless it follows."""

@@ -100,9 +100,9 @@ class Registers:
         value = self.integer(feature, index)
         return next(entry for entry, number in self._features[feature].entries.items() if number == value)
 
-    def choose(self, feature: str, entry: str, index: int = 0) -> None:
+    def choose(self, feature: str, entry: str) -> None:
         """Sets an enumeration by its entry's name."""
-        self.set(feature, self._features[feature].entries[entry], index)
+        self.set(feature, self._features[feature].entries[entry])
 
     def set(self, name: str, value: int | float | str, index: int = 0) -> None:
         """The camera changes one of its own features, whatever a client may do."""

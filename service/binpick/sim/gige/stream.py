@@ -35,14 +35,12 @@ class Stream:
     def deliver(self, shot: Shot, image: Image, conditions: Conditions, wanted: bool) -> None:
         """Sends it if anybody wants it and nothing is in the way. Raises OSError when power goes meanwhile."""
         payload, stamp = pixels.pack(image, self._format(conditions)), self._stamp(shot.started_ns)
-        sends = wanted and conditions.plugged and conditions.answers and conditions.sends
+        sends = wanted and conditions.streams
         self._ledger.enter(self._head, shot, stamp, payload, sends)
         if sends:
             self._pace(conditions)
-            self._send(shot, Block(shot.block, stamp, payload, self._registers.integer("GevSCPSPacketSize")))
-
-    def _send(self, shot: Shot, block: Block) -> None:
-        self.sender.send(block, self._target(), led=self._led == shot.number)
+            block = Block(shot.block, stamp, payload, self._registers.integer("GevSCPSPacketSize"))
+            self.sender.send(block, self._target(), led=self._led == shot.number)
 
     def _pace(self, conditions: Conditions) -> None:
         """A limit below the link's speed counts; the simulated wire is faster than a real one unless it is told not to be."""
