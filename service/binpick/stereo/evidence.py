@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.compiled import compiled
-from binpick.stereo.refine import Cells, Refined
+from binpick.stereo.fit import Cells
+from binpick.stereo.refine import Refined
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
