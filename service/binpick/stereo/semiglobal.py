@@ -38,12 +38,13 @@ from binpick.stereo.strip import Strip, strips
 STRIP_ROWS, WARM_ROWS = 608, 26
 """Most rows that are matched at a time, half of a camera's, and rows above them from which the way down begins: so deep what is
 above is felt. They do not depend on the machine: the bytes are the same whoever computes a strip."""
-NONE = np.int16(-16)
+SCALE = 16
+"""Disparities are integers in 1/16 px, as OpenCV's are."""
+NONE = np.int16(-SCALE)
 """Nothing found: OpenCV's mark, one px below the range."""
 TOP = np.int16(32767)
 PAD = LANES
 """On both sides of a path's costs, TOP: what would be a disparity outside of the range."""
-SCALE = 16
 ONE = np.int32(1)
 Found = Int16[np.ndarray, "h found_w"]
 """1/16 px, NONE where nothing was found."""
