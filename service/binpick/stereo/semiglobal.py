@@ -5,13 +5,13 @@ down), the same uniqueness, check from the right and median of 3x3. Only fractio
 not towards zero, which made OpenCV's 1/32 px too small on average. Sums end at 16 bits instead of wrapping.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Int16, UInt8
 
+from binpick import threads
 from binpick.data import Image
 from binpick.settings.stereo import Sgbm
 from binpick.stereo import costs
@@ -75,7 +75,7 @@ def _match(image: Image, other: UInt8[np.ndarray, "h other_w"], disparities: int
     """Disparities of an image whose pixels are found in the other one at x + disparity, wherever that one reaches so far."""
     rows, width = image.shape[0], other.shape[1] - disparities
     found = np.empty((rows, width), np.int16)
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-match") as pool:
+    with threads.pool("match") as pool:
         here, there = pool.map(costs.prepared, (image, other))
 
         def match(strip: Strip) -> None:
