@@ -11,14 +11,12 @@ from rich.table import Table
 
 from binpick.camera import backends
 from binpick.camera.group import CameraGroup
-from binpick.data import Light, StereoPair
+from binpick.data import StereoPair
 from binpick.errors import CameraError
 from binpick.lab import footprint
-from binpick.lab.rig import Plan, Rig, free
-from binpick.settings.cell import AravisCameras, CameraAddress
+from binpick.lab.rig import FULL, LIGHT, Plan, Rig, free
 from binpick.sim.gige.numbered import read
 
-LIGHT = Light(exposure_us=3000.0, gain_db=0.0, projector=True)
 PATIENCE_NS = 20_000_000_000
 PERIOD_S = 0.1
 
@@ -50,13 +48,12 @@ class Log:
             self.images.extend((*number, zlib.crc32(frame.image.data)))
 
 
-def run(seconds: float, size_px: tuple[int, int] = (1936, 1216),
+def run(seconds: float, size_px: tuple[int, int] = FULL,
         tick: Callable[[float], None] = lambda _: None) -> dict[str, Any]:
     """Ten pairs a second for so long; `tick` is told how far it is, 0 to 1."""
     plan = Plan(free(), size_px, numbered=True)
-    left, right = (CameraAddress(address=address) for address in plan.addresses)
     with Rig(plan) as rig:
-        group = backends.group(AravisCameras(left=left, right=right, max_skew_us=1_000_000.0))
+        group = backends.group(plan.cameras(max_skew_us=1_000_000.0))
         group.open(time.monotonic_ns() + PATIENCE_NS)
         try:
             log = Log()
