@@ -46,8 +46,11 @@ class Plan:
 
 
 def free(cameras: int = 2) -> tuple[str, ...]:
-    """Loopback addresses whose GigE Vision port was free a moment ago. Raises PortInUse."""
-    for number in sorted(range(20, 250), key=lambda place: (place - os.getpid()) % 230):      # not where others begin
+    """Loopback addresses whose GigE Vision port, which is fixed, was free a moment ago. Raises PortInUse.
+
+    Each process begins elsewhere to look, so that two at once seldom meet.
+    """
+    for number in (20 + (os.getpid() + further) % 230 for further in range(230)):
         addresses = tuple(f"127.0.{number}.{2 + index}" for index in range(cameras))
         with ExitStack() as probes:
             try:
@@ -56,7 +59,7 @@ def free(cameras: int = 2) -> tuple[str, ...]:
             except OSError:
                 continue
             return addresses
-    raise PortInUse(f"no free loopback addresses for {cameras} simulated cameras (udp port {PORT})")
+    raise PortInUse(f"no loopback addresses are free for {cameras} simulated cameras (udp port {PORT}): end other simulators")
 
 
 class Rig:
