@@ -1,6 +1,5 @@
 """Every test: no leaked threads, free ports, a time limit, and a clock that does not blame it for the machine."""
 
-import contextlib
 import faulthandler
 import mmap
 import os
@@ -84,16 +83,8 @@ def free_port() -> int:
 
 @pytest.fixture
 def gige_addresses() -> tuple[str, str]:
-    """Two loopback addresses whose GigE Vision port, which is fixed, was free a moment ago; each run begins elsewhere to look,
-    so that two at once seldom meet."""
-    for number in (20 + (os.getpid() + further) % 230 for further in range(230)):
-        addresses = (f"127.0.{number}.2", f"127.0.{number}.3")
-        with contextlib.ExitStack() as probes:
-            try:
-                for address in addresses:
-                    probe = probes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                    probe.bind((address, 3956))
-            except OSError:
-                continue
-        return addresses
-    raise RuntimeError("no free pair of loopback addresses")
+    """Two loopback addresses where nothing listened a moment ago."""
+    from binpick.lab.rig import free
+
+    left, right = free()
+    return left, right

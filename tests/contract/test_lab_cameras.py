@@ -6,7 +6,8 @@ import pytest
 from rich.console import Console
 
 from binpick.lab import cameras
-from binpick.lab.cameras import SMALL, Trial
+from binpick.lab.cameras import Trial
+from binpick.lab.rig import SMALL
 
 pytestmark = pytest.mark.gige
 

@@ -27,7 +27,8 @@ def test_outages_are_timed() -> None:
     assert "3 reconnects, before: " in sheet.getvalue()
 
 
-def test_a_long_run_reads_the_number_of_every_picture() -> None:
+def test_a_long_run_reads_the_number_of_every_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak, "JUDGED", 12)
     run = soak.run(3.0, (640, 400))
     assert run["pairs"] + run["lost"] == 31
     assert (run["lost"], run["mispaired"], run["stale"], run["wrong_images"]) == (0, 0, 0, 0)
@@ -35,6 +36,14 @@ def test_a_long_run_reads_the_number_of_every_picture() -> None:
     sheet = io.StringIO()
     Console(file=sheet, width=150).print(soak.table(run))
     assert "mispaired" in sheet.getvalue()
+
+
+def test_an_image_that_was_not_sent_so_is_wrong_and_compared_once() -> None:
+    log = soak.Log()
+    log.images.extend((0, 5, 111, 1, 5, 222))
+    log.judge([{5: 111}, {5: 999}])
+    log.judge([{}, {}])             # all that was sent is forgotten: so long a run may be
+    assert log.wrong == 1
 
 
 @pytest.mark.parametrize(("option", "value", "figure"), [("--reconnects", "1", "faults"), ("--soak", "1", "mispaired")])

@@ -73,6 +73,15 @@ def test_the_table_pools_bins_and_knows_what_is_missing():
     assert "-" in says
 
 
+def test_a_bin_without_a_pose_has_no_time_until_the_first():
+    run = json.loads(json.dumps(poses.figures("A", 25, [
+        Sheet("block", "block", 1, (given(),), {1: 1.0}, 90.0), Sheet("mixed", "tee", 1, (), {}, float("nan"))])))
+    assert [run["bins"][name]["first_ms"] for name in ("block", "mixed", "all")] == [90.0, None, 90.0]
+    console = Console(width=220, record=True, file=io.StringIO())
+    console.print(poses.table(run))
+    assert [line.split()[-2] for line in console.export_text().splitlines() if " mixed " in line] == ["-"]
+
+
 @pytest.mark.slow
 def test_the_command_prints_its_figures(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["binpick", "bench", "pose", "--tuning", "--world", "B", "--scenes", "1", "--parts", "3",

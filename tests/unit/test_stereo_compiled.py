@@ -5,6 +5,7 @@ import types
 
 import pytest
 
+from binpick.stereo import compiled as module
 from binpick.stereo.compiled import compiled
 
 
@@ -21,3 +22,14 @@ def test_what_cannot_be_kept_is_compiled_anew_and_said(caplog: pytest.LogCapture
     with caplog.at_level(logging.WARNING):
         assert compiled(nowhere)(1.0, 4.0) == 0.25
     assert "cannot be kept, starting takes longer" in caplog.text
+
+
+def test_what_was_kept_is_void_when_any_module_of_the_package_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Functions contain those that they call: of another file, which may be all that changed."""
+    compiled(ratio)(1.0, 4.0)
+    kept = compiled(ratio)
+    kept(1.0, 4.0)
+    monkeypatch.setattr(module, "SOURCES", "others")
+    anew = compiled(ratio)
+    anew(1.0, 4.0)
+    assert [sum(each.stats.cache_hits.values()) for each in (kept, anew)] == [1, 0]

@@ -4,15 +4,13 @@ A slice is cut from a part or a face in a frame of its own: z the approach (alon
 its principal axes. What is measured of it gives the width; the watertight height map says where the fingertips find room.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from binpick import geometry
+from binpick import geometry, threads
 from binpick.data import Grasp, Segments
 from binpick.grasp import clearance, sigma, slices
 from binpick.grasp.clearance import Obstacles
@@ -95,7 +93,7 @@ def _room(cut: Slices, fingers: Fingers, scene: Obstacles, margin_m: float) -> R
     Fingers are as wide at their tips as further up: where tips passed with the same gap, the rest of the finger passes too.
     """
     room = Room(grip=np.zeros(len(cut.part)), gap_m=np.zeros(len(cut.part)))
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-room") as pool:
+    with threads.pool("room") as pool:
         depths = list(pool.map(partial(_deepest, cut, fingers, scene, margin_m), GAPS_M))
     for gap_m, grip in zip(GAPS_M, depths, strict=True):
         deeper = np.flatnonzero(grip > room.grip)

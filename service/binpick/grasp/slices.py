@@ -4,7 +4,6 @@ All slices of a scene are cut at once: every measured point falls into a strip o
 one sort orders them, and a slice is a window over neighbouring strips.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TypeAlias
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from binpick import threads
 from binpick.data import Labels, Segments
 from binpick.grasp.bars import Circles, circles, moments
 
@@ -95,7 +95,7 @@ def cut(segments: Segments, width_m: float, max_tilt_rad: float, half_m: tuple[f
     turned = [(view, angle) for view in views for angle in _axes(view)]
     # in two halves, however many threads there are, so that nothing depends on their number
     halves = turned[:len(turned) // 2], turned[len(turned) // 2:]
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-slices") as pool:
+    with threads.pool("slices") as pool:
         one, other = pool.map(partial(_along, width_m=width_m), halves)
     other = replace(other, axis=other.axis + len(halves[0]))
     return Slices(*(np.concatenate([getattr(one, field.name), getattr(other, field.name)]) for field in fields(Slices)))
@@ -108,10 +108,10 @@ def _along(turned: list[tuple[View, float]], width_m: float) -> Slices:
         return Slices(whole, whole, np.zeros((0, 3, 3)), real, real, real, real, real, np.zeros((0, 2)), real, real, real)
     pitch = width_m / STRIPS
     strips = _strips(turned, pitch)
-    known = np.isfinite(strips.low)
-    which, window = np.nonzero(known.sum(axis=2) >= LEAST_STRIPS)
+    which, window = np.nonzero(np.isfinite(strips.low).sum(axis=2) >= LEAST_STRIPS)
     low, high, low_z, high_z = (values[which, window] for values in (strips.low, strips.high, strips.low_z, strips.high_z))
-    (n_x, n_z, *sums), (x_m, z_m) = np.nansum(strips.sums[:, which, window], axis=2), strips.middle[which].T
+    n_x, n_z, *sums = np.nansum(strips.sums[:, which, window], axis=2)
+    x_m, z_m = strips.middle[which].T
     at = (np.arange(STRIPS) - (STRIPS - 1) / 2) * pitch
     (low_slope, low_off), (high_slope, high_off) = (_lines(at, ends) for ends in (low, high))
     ends_z = np.stack([_mean(low_z), _mean(high_z)])

@@ -1,11 +1,11 @@
 """Suction grasps: where every lip of the tool lies on one part within its compliance, on measured points only."""
 
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
+from binpick import threads
 from binpick.data import Grasp, Segments
 from binpick.grasp import bars, sigma
 from binpick.grasp.seal import Seal, on_one_part, seal
@@ -37,16 +37,16 @@ def candidates(segments: Segments, tool: SuctionTool, sigma_z_m: Float32[np.ndar
     spacing_m = spacing(segments)
     at, narrow = spots(segments, min(cup.radius_m for cup in tool.cups), spacing_m)
     at, T_bin_spot = _turned(segments, at, tool)
-    reasons = {"spots": len(at) + narrow, "rim_not_on_one_part": narrow}
+    reasons = Counter(spots=len(at) + narrow, rim_not_on_one_part=narrow)
     if not len(at):
         return [], reasons
     # parts do not need each other; two halves, however many threads there are, so that nothing depends on their number
     half = segments.parts[at[:, 0], at[:, 1]] % 2
     halves = [np.flatnonzero(half == which) for which in (0, 1)]
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-seal") as pool:
+    with threads.pool("seal") as pool:
         tried = list(pool.map(lambda some: _tried(segments, at[some], T_bin_spot[some], tool, spacing_m, sigma_z_m), halves))
     for _, _, more in tried:
-        reasons |= {reason: count + reasons.get(reason, 0) for reason, count in more.items()}
+        reasons.update(more)
     whose = np.concatenate([some[chosen] for some, (chosen, _, _) in zip(halves, tried, strict=True)])
     grasps = [grasp for _, found, _ in tried for grasp in found]
     return [grasps[i] for i in np.argsort(whose).tolist()], reasons

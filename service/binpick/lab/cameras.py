@@ -13,14 +13,11 @@ from rich.table import Table
 
 from binpick.camera import backends
 from binpick.camera.group import CameraGroup
-from binpick.data import Light, StereoPair
+from binpick.data import StereoPair
 from binpick.errors import CameraError, PairRefused
-from binpick.lab.rig import Plan, Rig, free
-from binpick.settings.cell import AravisCameras, CameraAddress, Sync
+from binpick.lab.rig import FULL, LIGHT, SMALL, Plan, Rig, free
+from binpick.settings.cell import Sync
 
-LIGHT = Light(exposure_us=3000.0, gain_db=0.0, projector=True)
-FULL = (1936, 1216)
-SMALL = (640, 400)
 LIMIT_US = 1000.0
 """max_skew_us of the series with injected skews: below it pairs are accepted, above it never."""
 PATIENCE_S = 20.0
@@ -83,9 +80,7 @@ def run(trials: Sequence[Trial]) -> Iterator[dict[str, Any]]:
     """One series' figures after the other."""
     for trial in trials:
         plan = Plan(free(), trial.size_px, trial.apart, trial.offset_s, trial.drift_ppm)
-        left, right = (CameraAddress(address=address) for address in plan.addresses)
-        cameras = AravisCameras(left=left, right=right, sync=trial.sync, max_skew_us=trial.max_skew_us,
-                                packet_size=trial.packet_size)
+        cameras = plan.cameras(sync=trial.sync, max_skew_us=trial.max_skew_us, packet_size=trial.packet_size)
         with Rig(plan) as rig:
             group = backends.group(cameras)
             _open(group)

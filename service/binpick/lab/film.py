@@ -39,11 +39,11 @@ def frame(inputs: CycleInput, cycle: CycleResult) -> Picture:
 
 
 def save(frames: Iterable[Picture], path: Path) -> None:
-    """Writes the film; it starts again at its end. Raises InputError for a kind of file that cannot move."""
+    """Writes the film; it starts again at its end. Raises InputError for a file that cannot move or has no folder."""
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: a film is a {SUFFIX} file")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}")
+        raise InputError(f"{path}: there is no folder {path.parent}: create it, or name another one")
     film = cv2.Animation()
     film.frames = list(frames)
     film.durations = [FRAME_MS] * (len(film.frames) - 1) + [LAST_MS]

@@ -17,6 +17,8 @@ from binpick.data import Image, Rectified
 from binpick.lab import depths, exam
 from binpick.settings import PRESETS, Hybrid, StereoSettings
 from binpick.stereo import evidence, filter, pyramid, refine, search, trust, weights
+from binpick.stereo.fit import Cells
+from binpick.stereo.refine import Field
 
 LESSONS = (("A", range(1, 11)), ("B", range(1, 11)))
 """World and seeds. Steel and scenes without the projector taught nothing but to distrust the others."""
@@ -83,7 +85,7 @@ def lessons(seeds: int) -> Iterator[tuple[Scene, Scene]]:
 def _both(pair: Rectified, target: Float32[np.ndarray, "h w"], part: Bool[np.ndarray, "h w"]) -> tuple[Scene, Scene]:
     """At full and at half resolution; `target` is the truth relative to the window's smallest disparity, px."""
     rows, cols = (side // 2 * 2 for side in part.shape)
-    nearest, mean = target[:rows:2, :cols:2], refine.mean_of_four(target)
+    nearest, mean = target[:rows:2, :cols:2], _mean_of_four(target)
     coarse = np.where(np.abs(mean - nearest) < 2 * pyramid.SAME_SURFACE_PX, mean, nearest)
     return (_scene(pair, PRESETS["quality"], refine.FULL, target, part, 1),
             _scene(pyramid.shrink(pair), PRESETS["fast"], refine.HALF, coarse, part[:rows:2, :cols:2], 2))
@@ -149,16 +151,30 @@ def _scene(pair: Rectified, settings: StereoSettings, reach: refine.Reach, targe
         places = np.sort(rng.choice(places, min(most, len(places)), replace=False))
 
         def at(planes: Iterable[Float32[np.ndarray, "h2 w2"]]) -> list[Float32[np.ndarray, "m"]]:
-            whole = (refine.spread(plane, (found.shape[0], found.shape[1])) for plane in planes)
+            whole = (_spread(plane, (found.shape[0], found.shape[1])) for plane in planes)
             return [plane[:height, :width].ravel()[places] for plane in whole]
 
         cells = at(seen.cells)
         pixels = [plane[:height, :width].ravel()[places] for plane in seen.pixels]
-        means = at(refine.mean_of_four(plane) for plane in seen.pixels)
+        means = at(_mean_of_four(plane) for plane in seen.pixels)
         return Lesson(np.stack(pixels + cells, axis=1), np.stack(means + cells, axis=1), off.ravel()[places])
 
     two = seen.two[:height, :width]
     return Scene(lesson(judged & ~two, ALONE), lesson(judged & two, BETWEEN), OFF_PX / scale)
+
+
+def _mean_of_four(field: Field) -> Cells:
+    """Of each 2x2 px, as `trust` has it; an odd last row or column is left out."""
+    rows, cols = (side // 2 * 2 for side in field.shape)
+    return np.asarray(cv2.resize(field[:rows, :cols], (cols // 2, rows // 2), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _spread(cells: Cells, shape: tuple[int, int]) -> Field:
+    """Each cell's value on its four pixels, as `trust` has it; the last ones also on an odd last row and column."""
+    rows, cols = cells.shape
+    even = cv2.resize(cells, (2 * cols, 2 * rows), interpolation=cv2.INTER_NEAREST)
+    spread: Field = cv2.copyMakeBorder(even, 0, shape[0] - 2 * rows, 0, shape[1] - 2 * cols, cv2.BORDER_REPLICATE)
+    return spread
 
 
 def fit(taught: Sequence[Scene]) -> weights.Model:

@@ -153,7 +153,6 @@ def row(done: Sequence[Sheet]) -> Figures:
     found = [{pose.part_id for pose in sheet.given if pose.adds_m <= GOOD_M} for sheet in done]
     shares = [(visibility, i in good) for sheet, good in zip(done, found, strict=True)
               for i, visibility in sheet.visibility.items()]
-
     timed = [sheet.first_ms for sheet in done if np.isfinite(sheet.first_ms)]
 
     def recall(low: float, high: float) -> Figures:

@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
@@ -16,19 +16,18 @@ from binpick.cell.gallery import Gallery
 from binpick.cell.meter import Meter
 from binpick.cell.worker import Worker
 from binpick.cycle import CycleInput, CycleResult
-from binpick.errors import Code, CycleRefused
+from binpick.errors import Code, CycleRefused, NotReady
 from binpick.lab import footprint
-from binpick.lab.rig import Plan, Rig, free
+from binpick.lab.rig import SMALL, Plan, Rig, free
 from binpick.result import Request, Result, ReturnCode
 from binpick.rig import Rig as RigFile
-from binpick.settings.cell import AravisCameras, CameraAddress
+from binpick.settings.cell import AravisCameras
 
 FAULTS = ("unplug", "power=off", "reboot=1", "stolen")
 OUTAGES_S = (0.5, 6.0, 0.5, 0.5)
 """After it was found: shorter, or longer than what the driver takes to let go of a dead camera, and the camera of its owner."""
 PATIENCE_S = 60.0
 NEVER_NS = 10**15
-SIZE = (640, 400)
 WARM = 10
 """Reconnects before what is left behind counts."""
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -37,18 +36,17 @@ POSE = settings.Pose(position_m=(0.0, 0.0, 1.0), rotvec_rad=(0.0, 0.0, 0.0))
 
 
 class Cell:
-    """A cell's thread over the cameras at these addresses, without perception: a cycle is its pair."""
+    """A cell's thread over these cameras, without perception: a cycle is its pair."""
 
-    def __init__(self, addresses: Sequence[str]) -> None:
-        left, right = (CameraAddress(address=address) for address in addresses)
+    def __init__(self, cameras: AravisCameras) -> None:
         self._settings = settings.Cell(
             bins=(settings.Bin(inner_size_m=(0.6, 0.4, 0.18), pose=POSE),), recipes=(settings.Recipe(frame="camera"),),
-            cameras=AravisCameras(left=left, right=right, max_skew_us=1_000_000.0), control="rest")
-        rig = RigFile.model_validate({"image_size_px": SIZE, "cameras": [
+            cameras=cameras, control="rest")
+        rig = RigFile.model_validate({"image_size_px": SMALL, "cameras": [
             {"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
             for name, T in (("left", EYE), ("right", ((1.0, 0.0, 0.0, -0.15), *EYE[1:])))]})
         self._board = Board(machine.State(max_age_ns=NEVER_NS), 1, "rest")
-        self._thread = worker.thread(Worker(self._board, Gallery(), backends.group(self._settings.cameras), rig, _accept,
+        self._thread = worker.thread(Worker(self._board, Gallery(), backends.group(cameras), rig, _accept,
                                             lambda _, cycle, __: cycle, None, time.monotonic_ns, Meter(rig)))
 
     def __enter__(self) -> "Cell":
@@ -82,11 +80,11 @@ def _accept(inputs: CycleInput, _proceed: Callable[[], None]) -> CycleResult:
 
 def run(reconnects: int, tick: Callable[[float], None] = lambda _: None) -> dict[str, Any]:
     """So many outages of the right camera: one fault after the other, of an idle cell and of one in a cycle, long and short."""
-    plan = Plan(free(), SIZE)
+    plan = Plan(free(), SMALL)
     outages = [(fault, step, outage_s) for outage_s in OUTAGES_S for step in ("idle", "cycle") for fault in FAULTS]
     times: dict[tuple[str, str], list[tuple[float, float]]] = {}
     memory: list[tuple[float, float]] = []
-    with Rig(plan) as rig, Cell(plan.addresses) as cell:
+    with Rig(plan) as rig, Cell(plan.cameras(max_skew_us=1_000_000.0)) as cell:
         _wait(cell.good)
         before = footprint.settled(2)
         for turn in range(reconnects):
@@ -124,7 +122,8 @@ def _wait(until: Callable[[], bool]) -> None:
     limit = time.monotonic() + PATIENCE_S
     while not until():
         if time.monotonic() > limit:
-            raise TimeoutError(f"the cell did not recover within {PATIENCE_S:.0f} s")
+            raise NotReady(f"the cell did not recover within {PATIENCE_S:.0f} s of a fault: run it again with nothing else "
+                           "running; if it ends here again, it is the service that does not recover")
         time.sleep(0.005)
 
 

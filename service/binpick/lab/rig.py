@@ -3,8 +3,7 @@
 import multiprocessing
 import os
 import socket
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -14,21 +13,18 @@ import numpy as np
 
 from binpick.data import Image, Light
 from binpick.errors import PortInUse
+from binpick.settings.cell import AravisCameras, CameraAddress
 from binpick.sim.gige import GigeGroup, faults
 from binpick.sim.gige.clock import host_ns
 from binpick.sim.gige.gvcp import PORT
+from binpick.sim.gige.ledger import Entry
 from binpick.sim.gige.numbered import Numbered
 from binpick.sim.gige.ptp import Oscillator
 
 START_S = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Exposure:
-    """One image as it really was: the start of exposure on the host's clock (since 1970), and the checksum of what was sent."""
-
-    started_ns: int
-    crc32: int
+FULL, SMALL = (1936, 1216), (640, 400)
+"""Sizes of images: a real camera's, and one for what does not depend on it."""
+LIGHT = Light(exposure_us=3000.0, gain_db=0.0, projector=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +33,24 @@ class Plan:
     second camera's clock against the host's; `numbered`: pictures carry their number."""
 
     addresses: tuple[str, ...]
-    size_px: tuple[int, int] = (1936, 1216)
+    size_px: tuple[int, int] = FULL
     apart: bool = False
     offset_s: float = 0.78
     drift_ppm: float = 40.0
     numbered: bool = False
 
+    def cameras(self, **settings: Any) -> AravisCameras:
+        """A cell's settings of the first two."""
+        left, right = (CameraAddress(address=address) for address in self.addresses)
+        return AravisCameras(left=left, right=right, **settings)
+
 
 def free(cameras: int = 2) -> tuple[str, ...]:
-    """Loopback addresses whose GigE Vision port was free a moment ago. Raises PortInUse."""
-    for number in sorted(range(20, 250), key=lambda place: (place - os.getpid()) % 230):      # not where others begin
+    """Loopback addresses whose GigE Vision port, which is fixed, was free a moment ago. Raises PortInUse.
+
+    Each process begins elsewhere to look, so that two at once seldom meet.
+    """
+    for number in (20 + (os.getpid() + further) % 230 for further in range(230)):
         addresses = tuple(f"127.0.{number}.{2 + index}" for index in range(cameras))
         with ExitStack() as probes:
             try:
@@ -55,7 +59,7 @@ def free(cameras: int = 2) -> tuple[str, ...]:
             except OSError:
                 continue
             return addresses
-    raise PortInUse(f"no free loopback addresses for {cameras} simulated cameras (udp port {PORT})")
+    raise PortInUse(f"no loopback addresses are free for {cameras} simulated cameras (udp port {PORT}): end other simulators")
 
 
 class Rig:
@@ -63,6 +67,7 @@ class Rig:
 
     def __init__(self, plan: Plan) -> None:
         context = multiprocessing.get_context("spawn")
+        self._plan = plan
         self._pipe, self._other = context.Pipe()
         self._process = context.Process(target=_serve, args=(self._other, plan), daemon=True, name="binpick-rig")
 
@@ -74,10 +79,13 @@ class Rig:
                 return self
         except EOFError:
             pass
-        raise PortInUse("the simulated cameras did not start")
+        self._process.terminate()
+        raise PortInUse(f"the simulated cameras at {', '.join(self._plan.addresses)} did not start: if no error is told above, "
+                        f"another program took udp port {PORT} there; run it again, with nothing else running")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._pipe.send(("stop",))
+        with suppress(BrokenPipeError):         # it ended before: what was asked last has failed, and says so
+            self._pipe.send(("stop",))
         self._process.join(5)
 
     def change(self, index: int, **changes: Any) -> None:
@@ -88,13 +96,15 @@ class Rig:
         """All cameras lose that share of their packets from now on, resent ones too."""
         self._ask("lose", fraction, seed)
 
-    def truth(self, index: int) -> dict[int, Exposure]:
+    def truth(self, index: int) -> dict[int, Entry]:
         """That camera's images by frame id."""
-        return {block: Exposure(started, crc) for block, started, crc in self._ask("truth", index)}
+        truth: dict[int, Entry] = self._ask("truth", index)
+        return truth
 
     def sent(self, index: int) -> dict[int, int]:
         """The checksums of that camera's images by their number since it got power."""
-        return {shot: crc for shot, _, crc in self._ask("sent", index)}
+        sent: dict[int, int] = self._ask("sent", index)
+        return sent
 
     def fault(self, words: str) -> None:
         """As `binpick sim --fault` has it."""
@@ -102,7 +112,8 @@ class Rig:
 
     def powered(self, index: int) -> bool:
         """Whether that camera is on."""
-        return bool(self._ask("powered", index))
+        powered: bool = self._ask("powered", index)
+        return powered
 
     def _ask(self, *what: Any) -> Any:
         self._pipe.send(what)
@@ -125,7 +136,7 @@ def _serve(pipe: Connection, plan: Plan) -> None:
             pipe.send(_answer(group, *what))
 
 
-def _answer(group: GigeGroup, verb: str, *arguments: Any) -> Sequence[tuple[int, int, int]]:
+def _answer(group: GigeGroup, verb: str, *arguments: Any) -> dict[int, Entry] | dict[int, int] | bool | None:
     match verb:
         case "change":
             index, changes = arguments
@@ -135,12 +146,12 @@ def _answer(group: GigeGroup, verb: str, *arguments: Any) -> Sequence[tuple[int,
         case "fault":
             faults.apply(group, faults.parse(*arguments))
         case "powered":
-            return [(1, 0, 0)] if group.powered(*arguments) else []
-        case "sent":
-            return [(entry.shot, entry.block, entry.crc32) for entry in group.truth(*arguments) if entry.sent]
+            return group.powered(*arguments)
         case "truth":
-            return [(entry.block, entry.started_ns, entry.crc32) for entry in group.truth(*arguments) if entry.sent]
-    return []
+            return {entry.block: entry for entry in group.truth(*arguments) if entry.sent}
+        case "sent":
+            return {entry.shot: entry.crc32 for entry in group.truth(*arguments) if entry.sent}
+    return None
 
 
 def _scene(index: int, width: int, height: int) -> Image:

@@ -19,12 +19,13 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 Integers = Int64[np.ndarray, "n"]
 Values = Float64[np.ndarray, "n"]
-Field = Float32[np.ndarray, "n"]
+Metres = Float32[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ways:
-    """All ways of one direction between pixels of interest: the pixels at their start, middle and end, and what lies between.
+    """All ways of one direction between pixels of interest: the pixels at their start, middle and end, counted in reading
+    order, and what lies between.
 
     `step_m` is how far the end lies above the start's surface; `bend_m` is positive at concave folds. `sigma_m` is the lesser
     depth noise of the two ends.
@@ -33,9 +34,9 @@ class Ways:
     start: Integers
     middle: Integers
     end: Integers
-    step_m: Field
-    bend_m: Field
-    sigma_m: Field
+    step_m: Metres
+    bend_m: Metres
+    sigma_m: Metres
 
 
 def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
@@ -43,7 +44,7 @@ def ways(surface: Surface, of_interest: Mask, half_px: int) -> list[Ways]:
     rows, cols = of_interest.shape
     pixels = np.flatnonzero(of_interest)
     xyz, normal = (np.ascontiguousarray(field.reshape(-1, 3)[pixels].T) for field in (surface.xyz, surface.normal))
-    offset: Field = np.einsum("kn,kn->n", xyz, normal)
+    offset: Metres = np.einsum("kn,kn->n", xyz, normal)
     sigma_m = surface.sigma_z_m.ravel()[pixels]
     # each pixel's place among those of interest, -1 for others, with a frame as wide as ways are long
     wide = 2 * half_px

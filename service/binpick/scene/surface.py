@@ -22,6 +22,7 @@ WINDOWS = ((0, 0), (-RADIUS, -RADIUS), (-RADIUS, RADIUS), (RADIUS, -RADIUS), (RA
 """Where the fit windows around a pixel are centred (row, column): on it, or with it at their corner."""
 _CENTRES = np.zeros((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=np.uint8)
 _CENTRES[tuple(np.array(WINDOWS).T + RADIUS)] = 1
+"""The same as a picture, for cv2.dilate."""
 _WEIGHTS = np.full(256, np.nan, dtype=np.float32)
 """By the number of measured pixels in a block: their share, or NaN, which passes through every division."""
 _WEIGHTS[2:5] = 0.5, 0.75, 1.0

@@ -1,15 +1,32 @@
 """Functions that become machine code when they are first called, and are kept on disk for the next process."""
 
+import hashlib
 import inspect
 import logging
 from collections.abc import Callable
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numba
+from numba.core import caching
 
 F = TypeVar("F", bound=Callable[..., object])
 
 log = logging.getLogger(__name__)
+
+SOURCES = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+"""Of all modules whose functions become part of each other's machine code."""
+
+
+def _together(locator: Any) -> Any:
+    """A place to keep machine code that is void once any of SOURCES changed; numba's own asks for the caller's file alone."""
+    return type(locator.__name__, (locator,), {"get_source_stamp": lambda self: (SOURCES, locator.get_source_stamp(self))})
+
+
+Named, Beside, Users = map(_together, (caching.UserProvidedCacheLocator, caching.InTreeCacheLocator,
+                                       caching.UserWideCacheLocator))
+"""NUMBA_CACHE_DIR, the sources' __pycache__, the user's own cache: the first that can be written."""
+numba.config.CACHE_LOCATOR_CLASSES = ",".join(f"{__name__}.{place}" for place in ("Named", "Beside", "Users"))
 
 
 def compiled(function: F) -> F:

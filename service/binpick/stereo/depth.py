@@ -1,6 +1,5 @@
 """Measured disparity of a rectified pair, or of several shots: search, confirm, refine, judge."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from binpick import threads
 from binpick.data import Depth, Disparity, Image, Light, Mask, Rectified, Window, frozen
 from binpick.settings import StereoSettings
 from binpick.settings.stereo import Hybrid, Onnx, Sgbm
@@ -60,7 +60,7 @@ def _measure(rectified: Rectified, matcher: search.Plain, settings: StereoSettin
     whole = search.search(seen.left, seen.right, seen.window.num_disparities, matcher)
     found = np.ascontiguousarray(whole[:, rectified.margin:])
     cut = strips(found.shape[0], STRIP_ROWS, OVERLAP_ROWS)
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-strip") as pool:
+    with threads.pool("strip") as pool:
         # planes need no confidence: they are fitted beside the right view's search
         confirming = pool.submit(filter.confirm, whole, seen, matcher)
         refined = list(pool.map(lambda rows: refine.refine(found[rows.seen], rows.of(rectified), scale.reach), cut))

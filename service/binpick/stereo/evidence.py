@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo.compiled import compiled
-from binpick.stereo.refine import Cells, Refined
+from binpick.stereo.fit import Cells
+from binpick.stereo.refine import Refined
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
@@ -17,7 +18,9 @@ NOISE_VARIANCE, NOISE_PER_STEP = 8.0, 1 / 16
 """Squared grey levels of the difference of two pixels: twice a read noise of 2, and shot noise of the brightness."""
 PER_SIGMA = (1 / np.sqrt(NOISE_VARIANCE + NOISE_PER_STEP * np.arange(256))).astype(np.float32)
 """Of each grey level."""
-HALF, BEYOND = np.float32(0.5), np.float32(4096)
+HALF = np.float32(0.5)
+BEYOND = np.float32(4096)
+"""Px; further than any disparity: what is not matched is never the lowest."""
 MOST = 5.0
 """Differences between the images count up to so many sigma of noise: beyond, something else is seen."""
 NEAR_PX = 3
@@ -136,8 +139,8 @@ def _unlike(grey: Line, scale: Line, there: Line, unlike: Line) -> None:
         unlike[u] = off if off < np.float32(MOST) else np.float32(MOST)
 
 
-def _of_cells(left: Image, seen: Image, known: Bool[np.ndarray, "h w"], refined: Refined,
-              confidence: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "m h2 w2"]:
+def _of_cells(left: Image, seen: Image, known: Known, refined: Refined, confidence: UInt8[np.ndarray, "h w"],
+              ) -> Float32[np.ndarray, "m h2 w2"]:
     rows, cols = refined.misfit.shape
     cells = np.empty((len(OF_CELLS), rows, cols), np.float32)
     put = dict(zip(OF_CELLS, cells, strict=True))

@@ -11,6 +11,7 @@ from binpick.settings import StereoSettings
 from binpick.settings.stereo import Onnx
 from binpick.stereo import pyramid, search
 from binpick.stereo.compiled import compiled
+from binpick.stereo.pyramid import HalfField
 from binpick.stereo.search import SCALE, Plain
 
 AGREEMENT = 12
@@ -20,6 +21,7 @@ EDGE_RADIUS, ROLL_OFF = 1, 1e-3
 UNMATCHED = -SCALE
 Fixed = Int16[np.ndarray, "half_h half_w"]
 Share = Float32[np.ndarray, "half_h half_w"]
+"""0 to 1, or to 255."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +42,7 @@ def confirm(found: Disparity, rectified: Rectified, matcher: Plain) -> tuple[UIn
     half = pyramid.shrink(rectified)
     views = Views(_fixed(pyramid.coarse(found, rectified.window)), _fixed(_right(half, rectified, matcher)), half.margin)
     shape = rectified.window.height, rectified.window.width
-    return _grown(_confidence(views), shape).astype(np.uint8), views
+    return pyramid.large(_confidence(views), shape, cv2.INTER_LINEAR).astype(np.uint8), views
 
 
 def fill(views: Views, rectified: Rectified, settings: StereoSettings, guide: Image | None,
@@ -58,7 +60,7 @@ def fill(views: Views, rectified: Rectified, settings: StereoSettings, guide: Im
     rows, cols = views.left.shape
     smooth = wls.filter(views.left, seen, disparity_map_right=-views.right, ROI=(views.margin, 0, cols - views.margin, rows))
     filled = np.asarray(smooth[:, views.margin:], np.float32) * np.float32(2 / SCALE)
-    return _grown(filled, (window.height, window.width)) + np.float32(window.min_disparity)
+    return pyramid.large(filled, (window.height, window.width), cv2.INTER_LINEAR) + np.float32(window.min_disparity)
 
 
 def _confidence(views: Views) -> Share:
@@ -67,7 +69,7 @@ def _confidence(views: Views) -> Share:
     return _agreed(left, right, _flat(left), _flat(right), views.margin)
 
 
-def _flat(fixed: np.ndarray) -> Share:
+def _flat(fixed: Fixed) -> Share:
     """1 on a surface, less where disparities vary."""
     size = 2 * EDGE_RADIUS + 1
     view = np.ascontiguousarray(fixed)
@@ -77,13 +79,12 @@ def _flat(fixed: np.ndarray) -> Share:
 
 
 @compiled
-def _agreed(left: Int16[np.ndarray, "h w"], right: Int16[np.ndarray, "h w"], left_flat: Float32[np.ndarray, "h w"],
-            right_flat: Float32[np.ndarray, "h w"], margin: int) -> Float32[np.ndarray, "h w"]:
+def _agreed(left: Fixed, right: Fixed, left_flat: Share, right_flat: Share, margin: int) -> Share:
     rows, cols = left.shape
     confidence = np.empty((rows, cols), np.float32)
     for v in range(rows):
         for u in range(cols):
-            share, there = left_flat[v, u], u + margin - (np.int32(left[v, u]) >> 4)
+            share, there = left_flat[v, u], u + margin - np.int32(left[v, u]) // SCALE
             if 0 <= there < cols:
                 agree = abs(np.int32(left[v, u]) - np.int32(right[v, there])) < AGREEMENT
                 share = min(share, right_flat[v, there]) if agree else np.float32(0)
@@ -91,7 +92,7 @@ def _agreed(left: Int16[np.ndarray, "h w"], right: Int16[np.ndarray, "h w"], lef
     return confidence
 
 
-def _right(half: Rectified, rectified: Rectified, matcher: Plain) -> Float32[np.ndarray, "half_h half_w"]:
+def _right(half: Rectified, rectified: Rectified, matcher: Plain) -> HalfField:
     """The right view's disparity at half resolution, in its pixels."""
     if isinstance(matcher, Onnx):
         whole = search.search_right(rectified.left, rectified.right, rectified.window.num_disparities, matcher)
@@ -99,13 +100,7 @@ def _right(half: Rectified, rectified: Rectified, matcher: Plain) -> Float32[np.
     return search.search_right(half.left, half.right, half.window.num_disparities, matcher)
 
 
-def _fixed(disparity: Disparity) -> np.ndarray:
+def _fixed(disparity: HalfField) -> Fixed:
     """As OpenCV writes disparities: 1/16 px, below zero where there is none."""
-    return np.where(np.isfinite(disparity), disparity * SCALE, UNMATCHED).astype(np.int16)
-
-
-def _grown(field: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """From half to full resolution."""
-    rows, cols = field.shape
-    large = cv2.resize(field, (2 * cols, 2 * rows), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(large[:shape[0], :shape[1]])
+    fixed: Fixed = np.where(np.isfinite(disparity), disparity * SCALE, UNMATCHED).astype(np.int16)
+    return fixed

@@ -72,8 +72,8 @@ def _planes(weight: Padded, weighted: Padded, squared: Padded, taps: Float32[np.
 
 
 @compiled
-def _row(moments: Float32[np.ndarray, "10 w"], share: np.float32, says: sums.Line, levels: sums.Line, slopes_u: sums.Line,
-         slopes_v: sums.Line, supports: Float32[np.ndarray, "cells"]) -> None:
+def _row(moments: Float32[np.ndarray, "10 w"], share: np.float32, says: sums.Longer, levels: sums.Longer,
+         slopes_u: sums.Longer, slopes_v: sums.Longer, supports: sums.Line) -> None:
     """The planes of a row: say; level and slopes times that; support."""
     for i in range(len(supports)):
         n = max(moments[0, i], LEAST_SUPPORT)

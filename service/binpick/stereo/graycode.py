@@ -65,9 +65,9 @@ def complete(lights: tuple[Light, ...]) -> bool:
 
 
 def measure(shots: tuple[Rectified, ...], lights: tuple[Light, ...], speckle_px: int) -> Depth:
-    """The depth of the window's pixels from a complete sequence, without islands of fewer than `speckle_px` pixels.
+    """The depth of the window's pixels from a complete sequence, without islands of up to `speckle_px` pixels.
 
-    `filled` holds the nearest measured disparity (0 when there is none).
+    `fill` gives the nearest measured disparity (0 when there is none).
     """
     disparity, sigma_px = decode(shots, lights)
     low = shots[0].window.min_disparity

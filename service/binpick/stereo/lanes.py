@@ -35,8 +35,8 @@ BYTES, WORDS = Lanes(8), Lanes(16)
 OF = {types.uint8: BYTES, types.int16: WORDS}
 
 
-def _vector(lanes: Lanes, bits: int = 0) -> Any:
-    return ir.VectorType(ir.IntType(bits or lanes.bits), LANES)
+def _vector(lanes: Lanes) -> Any:
+    return ir.VectorType(ir.IntType(lanes.bits), LANES)
 
 
 def _constant(bits: int, numbers: list[int]) -> Any:

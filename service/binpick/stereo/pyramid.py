@@ -52,14 +52,14 @@ def double(depth: Depth, window: Window) -> Depth:
     disparity = _fine(depth.disparity, shape)
     disparity *= 2
     disparity += low
-    confidence = np.asarray(_large(depth.confidence, shape, cv2.INTER_LINEAR), np.uint8)
+    confidence = np.asarray(large(depth.confidence, shape, cv2.INTER_LINEAR), np.uint8)
     return Depth(disparity=frozen(disparity), fill=partial(_filled, depth, shape, low), confidence=frozen(confidence),
                  measured=frozen(np.isfinite(disparity)),
-                 sigma_px=frozen(_large(2 * depth.sigma_px, shape, cv2.INTER_NEAREST)))
+                 sigma_px=frozen(large(2 * depth.sigma_px, shape, cv2.INTER_NEAREST)))
 
 
 def _filled(depth: Depth, shape: tuple[int, int], low: np.float32) -> Disparity:
-    return _large(2 * depth.filled + low, shape, cv2.INTER_LINEAR)
+    return large(2 * depth.filled + low, shape, cv2.INTER_LINEAR)
 
 
 def _half(num_disparities: int) -> int:
@@ -74,14 +74,15 @@ def _shrunk(image: Image, window: Window) -> HalfImage:
     return shrunk
 
 
-def _large(field: np.ndarray, shape: tuple[int, int], interpolation: int) -> np.ndarray:
+def large(field: np.ndarray, shape: tuple[int, int], interpolation: int) -> np.ndarray:
+    """A field of the shrunk grid on the full one of this shape, by one of OpenCV's interpolations."""
     rows, cols = field.shape
     return np.asarray(cv2.resize(field, (2 * cols, 2 * rows), interpolation=interpolation)[:shape[0], :shape[1]])
 
 
 def _fine(field: HalfField, shape: tuple[int, int]) -> Disparity:
     """Interpolated on a surface, the nearest pixel's value where one ends; NaN stays NaN."""
-    nearest, smooth = (_large(field, shape, way) for way in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
+    nearest, smooth = (large(field, shape, way) for way in (cv2.INTER_NEAREST, cv2.INTER_LINEAR))
     fine = nearest.copy()
     with np.errstate(invalid="ignore"):
         np.copyto(fine, smooth, where=cv2.absdiff(smooth, nearest) < SAME_SURFACE_PX)

@@ -15,11 +15,10 @@ from jaxtyping import Float32
 from binpick.data import Disparity, Image, Rectified
 from binpick.stereo import fit, sums
 from binpick.stereo.compiled import compiled
-from binpick.stereo.fit import Planes
+from binpick.stereo.fit import Cells, Planes
 from binpick.stereo.warp import Line, lengthened, sample
 
 Field = Float32[np.ndarray, "h w"]
-Cells = Float32[np.ndarray, "rows cols"]
 ZERO, QUARTER, ONE = np.float32(0), np.float32(0.25), np.float32(1)
 MOST_STEP = np.float32(0.25)
 """Px; a single correction counts no further: beyond that the image is not straight, or the match is wrong."""
@@ -121,27 +120,27 @@ def _corrected(matched: Disparity, left: Field, right: Float32[np.ndarray, "h wh
     """Of each 2x2 px, the disparity after one step of registration and its weight."""
     rows, cols = matched.shape[0] // 2, matched.shape[1] // 2
     disparity, weight = np.zeros((rows, cols), np.float32), np.zeros((rows, cols), np.float32)
-    sums = np.empty((5, matched.shape[1]), np.float32)
+    totals = np.empty((5, matched.shape[1]), np.float32)
     for row in range(rows):
-        sums[:] = 0
+        totals[:] = 0
         for v in (2 * row, 2 * row + 1):
-            _registered(matched[v], left[v], right[v], margin, sums)
+            _registered(matched[v], left[v], right[v], margin, totals)
         for col in range(cols):
-            g2, ge = sums[0, 2 * col] + sums[0, 2 * col + 1], sums[1, 2 * col] + sums[1, 2 * col + 1]
-            g2d = sums[2, 2 * col] + sums[2, 2 * col + 1]
-            known, plain = sums[3, 2 * col] + sums[3, 2 * col + 1], sums[4, 2 * col] + sums[4, 2 * col + 1]
+            g2, ge = totals[0, 2 * col] + totals[0, 2 * col + 1], totals[1, 2 * col] + totals[1, 2 * col + 1]
+            g2d = totals[2, 2 * col] + totals[2, 2 * col + 1]
+            known, plain = totals[3, 2 * col] + totals[3, 2 * col + 1], totals[4, 2 * col] + totals[4, 2 * col + 1]
             if known > 1:
                 step = min(max(ge / max(g2, LEAST_SLOPE), -MOST_STEP), MOST_STEP)
                 disparity[row, col] = (g2d / g2 if g2 > LEAST_SLOPE else plain / known) - step
-                mean = g2 * np.float32(0.25)
+                mean = g2 * QUARTER
                 weight[row, col] = mean / (1 + mean / STRONG) + LEAST_WEIGHT
     return disparity, weight
 
 
 @compiled
-def _registered(matched: Line, left: Line, right: Float32[np.ndarray, "whole_w"], margin: int, sums: Float32[np.ndarray, "5 w"],
-                ) -> None:
-    """A row's g², g e, g² d, count and d, added to `sums`."""
+def _registered(matched: Line, left: Line, right: Float32[np.ndarray, "whole_w"], margin: int,
+                totals: Float32[np.ndarray, "5 w"]) -> None:
+    """A row's g², g e, g² d, count and d, added to `totals`."""
     line, slopes = np.empty(len(right) + 1, np.float32), np.empty(len(right) + 1, np.float32)
     lengthened(right, line)
     _slopes(right, slopes)
@@ -155,11 +154,11 @@ def _registered(matched: Line, left: Line, right: Float32[np.ndarray, "whole_w"]
     for u in range(len(left)):
         known = ZERO if np.isnan(matched[u]) else ONE
         rise = (own[u] + slope[u]) * np.float32(0.5) * known
-        sums[0, u] += rise * rise
-        sums[1, u] += rise * (left[u] - value[u])
-        sums[2, u] += rise * rise * filled[u]
-        sums[3, u] += known
-        sums[4, u] += filled[u]
+        totals[0, u] += rise * rise
+        totals[1, u] += rise * (left[u] - value[u])
+        totals[2, u] += rise * rise * filled[u]
+        totals[3, u] += known
+        totals[4, u] += filled[u]
 
 
 @compiled
@@ -168,12 +167,6 @@ def _slopes(line: Line, slopes: Float32[np.ndarray, "longer"]) -> None:
     slopes[:] = 0
     for u in range(1, len(line) - 1):
         slopes[u] = (line[u + 1] - line[u - 1]) * np.float32(0.5)
-
-
-def mean_of_four(field: np.ndarray) -> Cells:
-    """Of each 2x2 px; an odd last row or column is left out."""
-    rows, cols = (side // 2 * 2 for side in field.shape)
-    return np.asarray(cv2.resize(field[:rows, :cols], (cols // 2, rows // 2), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _band(image: Image, band_px: int) -> Field:
@@ -226,11 +219,3 @@ def _counted(say: Cells, level: Cells, slope_u: Cells, slope_v: Cells, radius: i
             slopes_u[v, u] = (column[2, u] + column[2, at] + column[2, u + far] + slope_u[v + radius, at] * own) * scale
             slopes_v[v, u] = (column[3, u] + column[3, at] + column[3, u + far] + slope_v[v + radius, at] * own) * scale
     return says, levels, slopes_u, slopes_v
-
-
-def spread(cells: Cells, shape: tuple[int, int]) -> Field:
-    """Cells on all pixels: each cell's value on its four, the last ones also on an odd last row and column."""
-    rows, cols = cells.shape
-    even = cv2.resize(cells, (2 * cols, 2 * rows), interpolation=cv2.INTER_NEAREST)
-    spread: Field = cv2.copyMakeBorder(even, 0, shape[0] - 2 * rows, 0, shape[1] - 2 * cols, cv2.BORDER_REPLICATE)
-    return spread

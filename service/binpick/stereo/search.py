@@ -11,8 +11,7 @@ from binpick.errors import ImageError, InputError
 from binpick.settings.stereo import Bm, Onnx, Sgbm
 from binpick.stereo import network, semiglobal
 
-SCALE = 16
-"""OpenCV's disparities are integers in 1/16 px."""
+SCALE = semiglobal.SCALE
 STEP = 16
 """OpenCV searches multiples of this many disparities: StereoBM refuses others, StereoSGBM's documentation forbids them."""
 MOST_DISPARITIES = 2032

@@ -5,13 +5,13 @@ down), the same uniqueness, check from the right and median of 3x3. Only fractio
 not towards zero, which made OpenCV's 1/32 px too small on average. Sums end at 16 bits instead of wrapping.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Int16, UInt8
 
+from binpick import threads
 from binpick.data import Image
 from binpick.settings.stereo import Sgbm
 from binpick.stereo import costs
@@ -38,12 +38,13 @@ from binpick.stereo.strip import Strip, strips
 STRIP_ROWS, WARM_ROWS = 608, 26
 """Most rows that are matched at a time, half of a camera's, and rows above them from which the way down begins: so deep what is
 above is felt. They do not depend on the machine: the bytes are the same whoever computes a strip."""
-NONE = np.int16(-16)
+SCALE = 16
+"""Disparities are integers in 1/16 px, as OpenCV's are."""
+NONE = np.int16(-SCALE)
 """Nothing found: OpenCV's mark, one px below the range."""
 TOP = np.int16(32767)
 PAD = LANES
 """On both sides of a path's costs, TOP: what would be a disparity outside of the range."""
-SCALE = 16
 ONE = np.int32(1)
 Found = Int16[np.ndarray, "h found_w"]
 """1/16 px, NONE where nothing was found."""
@@ -74,7 +75,7 @@ def _match(image: Image, other: UInt8[np.ndarray, "h other_w"], disparities: int
     """Disparities of an image whose pixels are found in the other one at x + disparity, wherever that one reaches so far."""
     rows, width = image.shape[0], other.shape[1] - disparities
     found = np.empty((rows, width), np.int16)
-    with ThreadPoolExecutor(max(1, cv2.getNumThreads()), thread_name_prefix="binpick-match") as pool:
+    with threads.pool("match") as pool:
         here, there = pool.map(costs.prepared, (image, other))
 
         def match(strip: Strip) -> None:

@@ -6,6 +6,8 @@ from jaxtyping import Float32
 from binpick.stereo.compiled import compiled
 
 Line = Float32[np.ndarray, "w"]
+Longer = Float32[np.ndarray, "longer"]
+"""At least as long as the total."""
 Taps = Float32[np.ndarray, "taps"]
 """Weights, a multiple of four of them."""
 AT_ONCE = 4
@@ -20,15 +22,15 @@ def add(total: Line, values: Line, weight: np.float32) -> None:
 
 
 @compiled
-def add_four(total: Line, a: Line, b: Line, c: Line, d: Line, weights: Float32[np.ndarray, "4"]) -> None:
-    """Four rows more, that may be longer than the total."""
+def add_four(total: Line, a: Longer, b: Longer, c: Longer, d: Longer, weights: Float32[np.ndarray, "4"]) -> None:
+    """Four rows more."""
     of_a, of_b, of_c, of_d = weights[0], weights[1], weights[2], weights[3]
     for i in range(len(total)):
         total[i] += (a[i] * of_a + b[i] * of_b) + (c[i] * of_c + d[i] * of_d)
 
 
 @compiled
-def down(field: Float32[np.ndarray, "h w"], row: int, taps: Taps, total: Line) -> None:
+def down(field: Float32[np.ndarray, "h longer"], row: int, taps: Taps, total: Line) -> None:
     """The weighted sum of a field's rows from this one on."""
     total[:] = 0
     for k in range(0, len(taps), AT_ONCE):
@@ -36,7 +38,7 @@ def down(field: Float32[np.ndarray, "h w"], row: int, taps: Taps, total: Line) -
 
 
 @compiled
-def across(line: Float32[np.ndarray, "longer"], taps: Taps, total: Line) -> None:
+def across(line: Longer, taps: Taps, total: Line) -> None:
     """The weighted sum of what lies in a row from each place on."""
     total[:] = 0
     for k in range(0, len(taps), AT_ONCE):

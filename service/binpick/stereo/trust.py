@@ -22,8 +22,6 @@ from binpick.stereo.weights import Model, Network
 
 LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.02, 3.0
 """Sigma is no smaller than what a 14x14 px window can tell at best, and no larger than what it was fitted on."""
-BLOCK = 1024
-"""Columns that are taken through a network at a time: they stay in the cache."""
 QUARTER = np.float32(0.25)
 Pixels = Float32[np.ndarray, "n h w"]
 OfCells = Float32[np.ndarray, "m h2 w2"]
@@ -52,9 +50,8 @@ def judge(evidence: Evidence, model: Model) -> Trust:
 
 def answer(network: Network, measures: Measures) -> Float32[np.ndarray, "k"]:
     """The network's figure for every column of measures."""
-    weights, figures = _weights(network), np.empty(measures.shape[1], np.float32)
-    for begin in range(0, len(figures), BLOCK):
-        _answer(weights, np.ascontiguousarray(measures[:, begin:begin + BLOCK]), figures[begin:begin + BLOCK])
+    figures = np.empty(measures.shape[1], np.float32)
+    _answer(_weights(network), np.ascontiguousarray(measures), figures)
     return figures
 
 

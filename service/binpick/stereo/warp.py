@@ -23,7 +23,7 @@ def warp(right: Shaped[np.ndarray, "h whole_w ..."], disparity: Float32[np.ndarr
 
 
 @compiled
-def sample(line: Line, disparity: Line, margin: int, seen: Line) -> None:
+def sample(line: Float32[np.ndarray, "longer"], disparity: Line, margin: int, seen: Line) -> None:
     """The same for one row: `line`, of the right image, between its pixels. It needs one pixel more at its end; disparities lie
     within the margin, none is NaN."""
     for u in range(len(disparity)):
