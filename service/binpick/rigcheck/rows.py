@@ -1,10 +1,11 @@
 """Rows: how far partners of a production pair lie from their common row, and which small turn of a camera explains it."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 
 from binpick.data import Image, Rectified
 
@@ -61,7 +62,7 @@ def check(pair: Rectified) -> Rows:
     """
     left, right = _partners(pair)
     if len(left) < FEWEST:
-        return Rows(points=len(left), reason=f"only {len(left)} places of the pair were found in both views, {FEWEST} are needed")
+        return Rows(points=len(left), reason=f"only {len(left)} places were found in both views, {FEWEST} are needed")
     return fit(left, right, pair.focal_px)
 
 
@@ -73,18 +74,19 @@ def fit(left: Places, right: Places, focal_px: float) -> Rows:
     """
     rows_px = (right[:, 1] - left[:, 1]).astype(np.float64)
     x, y = (right.astype(np.float64) / focal_px).T
-    A = focal_px * np.column_stack([1 + y**2, -x])
+    design = focal_px * np.column_stack([1 + y**2, -x])
     weights = np.ones(len(rows_px))
     turn, spread = np.array([np.median(rows_px) / focal_px, 0.0]), np.inf
     for _ in range(ROUNDS):
-        residual = rows_px - A @ turn
+        residual = rows_px - design @ turn
         spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         weights = np.clip(1 - (residual / (TUKEY * spread)) ** 2, 0, None) ** 2
-        turn = np.linalg.solve((A.T * weights) @ A, (A.T * weights) @ rows_px)
+        turn = np.linalg.solve((design.T * weights) @ design, (design.T * weights) @ rows_px)
     kept = weights > 0
-    covariance = spread**2 * np.linalg.inv((A.T * weights) @ A)
+    covariance = spread**2 * np.linalg.inv((design.T * weights) @ design)
     sigma = np.sqrt(np.diag(covariance))
-    square = float(np.mean((A[kept] @ turn) ** 2) - np.mean(np.einsum("ij,jk,ik->i", A[kept], covariance, A[kept])))
+    chance = np.einsum("ij,jk,ik->i", design[kept], covariance, design[kept])
+    square = float(np.mean((design[kept] @ turn) ** 2 - chance))
     return Rows(row_px=float(np.median(rows_px[kept])), sigma_px=1.2533 * spread / float(np.sqrt(kept.sum())),
                 points=int(kept.sum()), off_px=float(np.sqrt(max(square, 0.0))), pitch_rad=float(turn[0]),
                 roll_rad=float(turn[1]), sigma_pitch_rad=float(sigma[0]), sigma_roll_rad=float(sigma[1]))
@@ -118,8 +120,8 @@ def _textured(image: Image, margin: int) -> Places:
     rows = np.linspace(edge, image.shape[0] - edge, CELLS[1] + 1).astype(int)
     columns = np.linspace(margin + edge, image.shape[1] - edge, CELLS[0] + 1).astype(int)
     places = []
-    for top, bottom in zip(rows[:-1], rows[1:], strict=True):
-        for start, end in zip(columns[:-1], columns[1:], strict=True):
+    for top, bottom in pairwise(rows.tolist()):
+        for start, end in pairwise(columns.tolist()):
             if bottom > top and end > start:
                 _, most, _, (x, y) = cv2.minMaxLoc(strength[top:bottom, start:end])
                 if most > LEAST_TEXTURE:

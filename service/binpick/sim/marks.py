@@ -23,7 +23,7 @@ MODULES = 8
 PLACES = {"A": (0.044, ((-0.43, 0.06), (-0.43, -0.10), (0.432, 0.10), (0.432, -0.10), (-0.10, 0.275), (0.16, 0.275),
                         (-0.10, -0.31), (0.16, -0.31))),
           "B": (0.024, ((-0.11, 0.142), (0.0, 0.142), (0.10, 0.142), (-0.11, -0.142), (0.0, -0.142), (0.10, -0.142)))}
-"""Per world the side of the tags, and where they lie in the bin's frame, metres: on the table, in both views, beside the bin."""
+"""Per world the tags' side, and where they lie in the bin's frame, metres: on the table, in both views, beside the bin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ def painted(marks: tuple[Mark, ...], points: Float32[np.ndarray, "n 3"], reflect
         on = (np.abs(local[:, :2]) < half).all(axis=1)
         cell_m = np.float32(mark.side_m / (MODULES * CELLS))
         # the middle of raster cell 0 lies half a cell inside its edge
-        column, row = ((np.float32(half) + sign * local[on, axis]) / cell_m - np.float32(0.5) for axis, sign in ((0, 1), (1, -1)))
+        column, row = ((np.float32(half) + upright) / cell_m - np.float32(0.5) for upright in (local[on, 0], -local[on, 1]))
         painted[near[on]] = sample(_raster(mark.number, float(pixel_m / cell_m)), column, row, cv2.BORDER_REPLICATE)
     return painted
 
