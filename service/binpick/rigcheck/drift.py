@@ -149,14 +149,12 @@ def _said(what: Sequence[str], do: str) -> str:
     return f"{text[0].upper()}{text[1:]}: {do}."
 
 
-def unseen(rows: bool, marks: bool, located: bool) -> tuple[str, ...]:
-    """What drift is not told by what is looked at, as sentences for reports and health."""
+def unseen(marks: bool, located: bool = False) -> tuple[str, ...]:
+    """What drift is not told by what is looked at, as sentences for reports and health; `located`: the bin is looked for."""
     if marks:
         return ("Marks show a bumped mount and a turned camera; a lens or a baseline that changed looks like one of these.",)
-    blind = ["Rows do not show the cameras turned towards or away from each other (yaw), a baseline or a focal length that "
-             "changed, nor which of the two cameras turned: depths err unseen." if rows else
-             "Nothing watches the cameras' rows: a camera that turned is not noticed."]
-    blind.append("The bin's rim shows a mount that moved or depths that err, but not apart from a bin that stands elsewhere."
-                 if located else "Nothing shows a mount that was bumped: poses in the robot's base would be off by as much.")
-    blind.append("Three tags or more fixed around the bin would show all of this.")
-    return tuple(blind)
+    blind = ("The bin's rim shows a mount that moved up or down and depths that err, but not apart from another bin." if located
+             else "Nothing shows a mount that was bumped: poses in the robot's base would be off by as much.")
+    rows = ("Rows do not show cameras that turned towards or away from each other (yaw), a baseline or a focal length that "
+            "changed, nor which of the two cameras turned: depths would err unseen.")
+    return rows, blind, "Three tags or more fixed around the bin would show a bumped mount and any turn of a camera."
