@@ -1,10 +1,11 @@
 """Drift against the truth: simulated rigs that are off by known turns and shifts, found in how many cycles, and how well."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from binpick import settings
 from binpick.data import Image, Light, Rectified
@@ -28,8 +29,6 @@ ROLL_PX = (1.5,)
 YAW_DEG = (0.01, 0.02, 0.05)
 SHIFT_MM = {1: (0.86, 0.26, -0.43), 2: (-0.65, 1.63, 0.97), 5: (1.97, -2.37, 3.94)}
 """Of the mount: 1, 2 and 5 mm, each along another line."""
-CYCLES = 30
-"""In which a drift must be found."""
 CALM = 12
 """Cycles after which a verdict has settled: a trial ends."""
 STORED = 5
@@ -73,14 +72,16 @@ def trials(world: str) -> tuple[Trial, ...]:
     return (*pitched, *rolled, *yawed, *shifted)
 
 
-def sit(world: str, seed: int, light: Light, chosen: Sequence[Trial]) -> Iterator[dict[str, Any]]:
+def sit(world: str, seed: int, light: Light, chosen: Sequence[Trial],
+        tick: Callable[[], None] = lambda: None) -> Iterator[dict[str, Any]]:
     """Each trial on one bin. Raises InputError for an unknown world."""
     scene = World(world, "mixed", PARTS, seed).scene()
     calm = cell(world, scene, light, NONE)
     reference = stored(calm)
     undrifted = depth_error(calm.rig, calm, shot=90)
     for trial in chosen:
-        yield run(trial, cell(world, scene, light, trial.drifted), reference if trial.by_marks else None, undrifted)
+        yield run(trial, cell(world, scene, light, trial.drifted), reference if trial.by_marks else None, undrifted,
+                  tick)
 
 
 def cell(world: str, scene: WorldScene, light: Light, drifted: Drift) -> Cell:
@@ -115,7 +116,8 @@ def looked(watch: Watch, at: Cell, shot: int, reference: Reference | None) -> Wa
     return drift.step(watch, seen, marks.compare(reference, [sighting(images)], at.rig) if reference is not None else None)
 
 
-def run(trial: Trial, at: Cell, reference: Reference | None, undrifted: tuple[float, float]) -> dict[str, Any]:
+def run(trial: Trial, at: Cell, reference: Reference | None, undrifted: tuple[float, float],
+        tick: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """One trial's row: when it was found, what was told, and the truth beside it."""
     watch, found = Watch(), {Level.WARN: 0, Level.FAULT: 0}
     for cycle in range(1, CALM + 1):
@@ -123,6 +125,7 @@ def run(trial: Trial, at: Cell, reference: Reference | None, undrifted: tuple[fl
         for level in (Level.WARN, Level.FAULT):
             if not found[level] and watch.level in (level, Level.FAULT):
                 found[level] = cycle
+        tick()
     focal_px = exam.setup(at.scene.world).right.focal_px[1]
     row: dict[str, Any] = {
         "trial": trial.name, "world": at.scene.world, "seed": at.scene.seed, "pattern": at.light.projector,
@@ -189,6 +192,34 @@ def calm(world: str, seeds: Sequence[int], light: Light, cycles: int,
     return {"world": world, "seeds": list(seeds), "pattern": light.projector, "cycles": len(levels),
             "warnings": sum(level is not Level.OK for level in levels), "largest_off_px": _px(worst[0]),
             "largest_depth_mm": _mm(worst[1]), "largest_shift_mm": _mm(worst[2])}
+
+
+def sit_all(chosen: Mapping[str, Sequence[Trial]], seeds: Sequence[int], lit: Light, cycles: int,
+            tick: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """The trials of each world, on the first bin, and so many cycles without drift over all bins."""
+    found = [row for world, trials_of in chosen.items() if trials_of for row in sit(world, seeds[0], lit, trials_of, tick)]
+    still = [calm(world, seeds, lit, cycles, tick) for world in chosen] if cycles else []
+    return {"exam_sha256": exam.sha256(), "trials": found, "calm": still}
+
+
+def tables(run: dict[str, Any]) -> tuple[Table, Table]:
+    """A run of `binpick bench drift` for people."""
+    found = Table("world", "drift", "level", "warns, faults after", "pitch px, true", "depth off mm, true", "shift mm, off by",
+                  "error of depth mm: undrifted, as it is, corrected", title="Drift of simulated rigs")
+    for row in run["trials"]:
+        errors = [f"{row[name]['depth_error_mm']:.2f}" for name in ("undrifted", "uncorrected", "corrected") if name in row]
+        found.add_row(row["world"], row["trial"], row["level"], _two(row, "warned_after", "fault_after"),
+                      _two(row, "pitch_px", "true_pitch_px"), _two(row, "depth_mm", "true_depth_mm"),
+                      _two(row, "shift_mm", "shift_off_mm"), ", ".join(errors))
+    still = Table("world", "cycles without drift", "that warn", "largest row px", "largest depth mm", "largest shift mm")
+    for row in run["calm"]:
+        still.add_row(row["world"], str(row["cycles"]), str(row["warnings"]), str(row["largest_off_px"]),
+                      str(row["largest_depth_mm"]), str(row["largest_shift_mm"]))
+    return found, still
+
+
+def _two(row: dict[str, Any], first: str, second: str) -> str:
+    return ", ".join("-" if row.get(name) is None else f"{row[name]:g}" for name in (first, second))
 
 
 def light(pattern: bool) -> Light:
