@@ -27,6 +27,7 @@ Pixels: TypeAlias = Float[np.ndarray, "n 2"]
 FEWEST = 3
 LOOSE_PX = 0.5
 """Corners further off count less and less: a mark may be half hidden, or have been moved."""
+ROUNDS = 2
 NEARLY_SQUARE = 0.03
 """A tag whose sides differ by more than this share is half hidden."""
 
@@ -119,7 +120,6 @@ def _gathered(reference: Reference, sightings: Sequence[Sighting], camera: int) 
 
 def _solved(reference: Reference, views: tuple[_View, ...], rig: Rig, count: int, missing: tuple[int, ...]) -> MarksCheck:
     middle = np.mean([np.mean(corners, axis=0) for corners in reference.marks.values()], axis=0)
-    # metres and radians are alike in size at a working distance of about one metre
     R_rect_second = axes(rig)
 
     def residuals(x: Float[np.ndarray, "9"]) -> Float[np.ndarray, "n"]:
@@ -127,9 +127,12 @@ def _solved(reference: Reference, views: tuple[_View, ...], rig: Rig, count: int
         return np.concatenate([pixels - _projected(points, rig, camera, T @ _moved(x, middle))
                                for camera, ((points, pixels, _), T) in enumerate(zip(views, poses, strict=True))]).ravel()
 
-    found = least_squares(residuals, np.zeros(9), loss="soft_l1", f_scale=LOOSE_PX, x_scale=1e-3)
-    residual = residuals(found.x)
-    spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
+    # metres and radians are alike in size at a working distance of about one metre
+    found = least_squares(residuals, np.zeros(9), loss="soft_l1", f_scale=LOOSE_PX, x_scale=1e-3, ftol=1e-6)
+    for _ in range(ROUNDS):     # from there on what is far off counts for next to nothing
+        loose_px = min(LOOSE_PX, 2 * _spread(residuals(found.x)))
+        found = least_squares(residuals, found.x, loss="cauchy", f_scale=loose_px, x_scale=1e-3, ftol=1e-6)
+    spread = _spread(residuals(found.x))
     covariance = spread**2 * np.linalg.inv(found.jac.T @ found.jac)
     sigma = np.sqrt(np.diag(covariance))
     rotation = tuple(found.x[6:].tolist())
@@ -139,6 +142,11 @@ def _solved(reference: Reference, views: tuple[_View, ...], rig: Rig, count: int
         depth_m=_depth_m(rig, middle, found.x[6:]), sigma_shift_m=float(np.linalg.norm(sigma[:3])),
         sigma_turn_rad=float(np.linalg.norm(sigma[3:6])), sigma_rotation_rad=tuple(sigma[6:].tolist()),
         sigma_depth_m=float(np.sqrt(slope @ covariance[6:, 6:] @ slope)), residual_px=spread, missing=missing)
+
+
+def _spread(residual: Float[np.ndarray, "n"]) -> float:
+    """The sigma of what is not far off."""
+    return 1.4826 * float(np.median(np.abs(residual))) + 1e-3
 
 
 def _moved(x: Float[np.ndarray, "n"], middle: Float[np.ndarray, "3"]) -> Transform:

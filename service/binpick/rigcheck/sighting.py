@@ -18,8 +18,10 @@ ALONG = (0.08, 0.92)
 SAMPLES = 48
 """Profiles across each side."""
 ACROSS = 0.7
-"""Modules that a profile goes to each side of the edge: a tag's border is one module of black, its margin at least one of
-white."""
+"""Modules that a profile goes to each side of the edge at first: a tag's border is one module of black, its margin at least one
+of white."""
+NEAR_PX = (3.0, 2.0, 2.0)
+"""Then: dots of a pattern on the white would draw the edge outwards."""
 STEP_PX = 0.5
 
 
@@ -38,7 +40,7 @@ def detect(image: Image, family: str) -> dict[int, Corners]:
         return {}
     # the middle of a pixel of half size lies between two of full size
     rough = {int(number): 2 * corners[0].astype(float) + 0.5 for number, corners in zip(ids.ravel(), found, strict=True)}
-    return {number: _refined(image, _refined(image, rough[number], bits), bits).astype(np.float32) for number in sorted(rough)}
+    return {number: _refined(image, rough[number], bits).astype(np.float32) for number in sorted(rough)}
 
 
 def _dictionary(family: str) -> tuple[cv2.aruco.Dictionary, int]:
@@ -52,24 +54,23 @@ def _dictionary(family: str) -> tuple[cv2.aruco.Dictionary, int]:
 
 
 def _refined(image: Image, corners: Float[np.ndarray, "4 2"], modules: int) -> Float[np.ndarray, "4 2"]:
-    """Where lines through the sides' edges meet."""
-    lines = [_line(edges) for edges in _edges(image, corners, modules)]
-    meets = np.array([np.cross(lines[side - 1], lines[side]) for side in range(4)])
-    refined: Float[np.ndarray, "4 2"] = meets[:, :2] / meets[:, 2:]
-    if not np.isfinite(refined).all():
-        return corners
-    return refined
+    """Where lines through the sides' edges meet, looked for ever nearer."""
+    side_px = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    for reach_px in (ACROSS * side_px / modules, *NEAR_PX):
+        lines = [_line(edges) for edges in _edges(image, corners, reach_px)]
+        meets = np.array([np.cross(lines[side - 1], lines[side]) for side in range(4)])
+        corners = meets[:, :2] / meets[:, 2:]
+    return corners
 
 
-def _edges(image: Image, corners: Float[np.ndarray, "4 2"], modules: int) -> Float[np.ndarray, "4 n 2"]:
+def _edges(image: Image, corners: Float[np.ndarray, "4 2"], reach_px: float) -> Float[np.ndarray, "4 n 2"]:
     """Places on each side's edge, from black inside to white outside: the middle of the rise along profiles square to it."""
     following = np.roll(corners, -1, axis=0)
     along = following - corners
     length = np.linalg.norm(along, axis=1, keepdims=True)
     outward = np.column_stack([along[:, 1], -along[:, 0]]) / length
     outward *= np.sign(((corners + following) / 2 - corners.mean(0)) @ outward.T).diagonal()[:, None]
-    reach = ACROSS * float(length.mean()) / modules
-    offsets = np.arange(-reach, reach + STEP_PX / 2, STEP_PX)
+    offsets = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
     start = corners[:, None] + np.linspace(*ALONG, SAMPLES)[:, None] * along[:, None]
     at = (start[:, :, None] + offsets[:, None] * outward[:, None, None]).astype(np.float32).reshape(4 * SAMPLES, -1, 2)
     values = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
