@@ -36,6 +36,9 @@ STORED = 5
 PARTS = 25
 
 
+Errors = dict[str, float | None]
+
+
 @dataclass(frozen=True, slots=True)
 class Trial:
     """One rig that is off; `by_marks`: marks are watched beside the rows."""
@@ -80,8 +83,7 @@ def sit(world: str, seed: int, light: Light, chosen: Sequence[Trial],
     reference = stored(calm)
     undrifted = depth_error(calm.rig, calm, shot=90)
     for trial in chosen:
-        yield run(trial, cell(world, scene, light, trial.drifted), reference if trial.by_marks else None, undrifted,
-                  tick)
+        yield run(trial, cell(world, scene, light, trial.drifted), reference, undrifted, tick)
 
 
 def cell(world: str, scene: WorldScene, light: Light, drifted: Drift) -> Cell:
@@ -116,12 +118,12 @@ def looked(watch: Watch, at: Cell, shot: int, reference: Reference | None) -> Wa
     return drift.step(watch, seen, marks.compare(reference, [sighting(images)], at.rig) if reference is not None else None)
 
 
-def run(trial: Trial, at: Cell, reference: Reference | None, undrifted: tuple[float, float],
+def run(trial: Trial, at: Cell, reference: Reference, undrifted: Errors,
         tick: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """One trial's row: when it was found, what was told, and the truth beside it."""
     watch, found = Watch(), {Level.WARN: 0, Level.FAULT: 0}
     for cycle in range(1, CALM + 1):
-        watch = looked(watch, at, 100 + cycle, reference)
+        watch = looked(watch, at, 100 + cycle, reference if trial.by_marks else None)
         for level in (Level.WARN, Level.FAULT):
             if not found[level] and watch.level in (level, Level.FAULT):
                 found[level] = cycle
@@ -132,16 +134,22 @@ def run(trial: Trial, at: Cell, reference: Reference | None, undrifted: tuple[fl
         "level": watch.level.value, "warned_after": found[Level.WARN] or None, "fault_after": found[Level.FAULT] or None,
         "row_px": _px(watch.row_px), "off_px": _px(watch.off_px),
         "pitch_px": _px(watch.rotation_rad[0] * focal_px), "true_pitch_px": _px(trial.drifted.pitch_rad * focal_px)}
-    if reference is not None:
+    if trial.by_marks:
         row |= {"shift_mm": _mm(watch.shift_m), "shift_off_mm": _mm(shift_error(watch, trial.drifted)),
                 "depth_mm": _mm(watch.depth_m), "true_depth_mm": _mm(true_depth_error(at.rig, trial.drifted, reference))}
     if trial.corrected:
-        now, _ = correction.applied(at.rig, watch.rotation_rad)
-        names = ("depth_error_mm", "measured")
-        row["undrifted"] = dict(zip(names, undrifted, strict=True))
-        row["uncorrected"] = dict(zip(names, depth_error(at.rig, at, shot=90), strict=True))
-        row["corrected"] = dict(zip(names, depth_error(now, at, shot=90), strict=True))
+        row |= {"undrifted": undrifted, "uncorrected": depth_error(at.rig, at, shot=90)}
+        if not trial.by_marks:
+            row["by_rows"] = depth_error(correction.applied(at.rig, watch.rotation_rad)[0], at, shot=90)
+        row["by_marks"] = depth_error(correction.applied(at.rig, turn_by_marks(at, reference))[0], at, shot=90)
     return row
+
+
+def turn_by_marks(at: Cell, reference: Reference) -> tuple[float, float, float]:
+    """The second camera's turn as some cycles of marks tell it."""
+    told = [marks.compare(reference, [sighting(at.expose(70 + shot))], at.rig).rotation_rad for shot in range(drift.FEWEST)]
+    pitch, yaw, roll = np.median(told, axis=0).tolist()
+    return pitch, yaw, roll
 
 
 def shift_error(watch: Watch, drifted: Drift) -> float:
@@ -160,8 +168,8 @@ def true_depth_error(rig: Rig, drifted: Drift, reference: Reference) -> float:
     return float((n[0] * t[2] - t[0]) / (R[0] - n[0] * R[2]) - middle[2])
 
 
-def depth_error(rig: Rig, at: Cell, shot: int) -> tuple[float, float]:
-    """Median error of depth on parts, mm, and the share of their pixels measured, when the cameras are believed to be `rig`.
+def depth_error(rig: Rig, at: Cell, shot: int) -> Errors:
+    """Of depth on parts, the median error, and the share of their pixels measured, when the cameras are believed to be `rig`.
 
     The left camera must stand where it stood: the truth is cast from it.
     """
@@ -172,7 +180,7 @@ def depth_error(rig: Rig, at: Cell, shot: int) -> tuple[float, float]:
     asked = regions(true, {part.part_id: part.kind for part in at.scene.parts}).parts & true.visible_both
     z, true_z = (pair.focal_px * pair.baseline_m / disparity[asked] for disparity in (measured.disparity, true.disparity))
     off = np.abs(z - true_z)[np.isfinite(z)]
-    return round(1000 * float(np.median(off)), 4) if off.size else float("nan"), round(off.size / int(asked.sum()), 3)
+    return {"depth_error_mm": _mm(np.median(off)) if off.size else None, "measured": round(off.size / int(asked.sum()), 3)}
 
 
 def calm(world: str, seeds: Sequence[int], light: Light, cycles: int,
@@ -205,9 +213,10 @@ def sit_all(chosen: Mapping[str, Sequence[Trial]], seeds: Sequence[int], lit: Li
 def tables(run: dict[str, Any]) -> tuple[Table, Table]:
     """A run of `binpick bench drift` for people."""
     found = Table("world", "drift", "level", "warns, faults after", "pitch px, true", "depth off mm, true", "shift mm, off by",
-                  "error of depth mm: undrifted, as it is, corrected", title="Drift of simulated rigs")
+                  "error of depth mm: undrifted, as it is, corrected by rows, by marks", title="Drift of simulated rigs")
     for row in run["trials"]:
-        errors = [f"{row[name]['depth_error_mm']:.2f}" for name in ("undrifted", "uncorrected", "corrected") if name in row]
+        kinds = ("undrifted", "uncorrected", "by_rows", "by_marks") if "by_marks" in row else ()
+        errors = [_depth(row.get(kind)) for kind in kinds]
         found.add_row(row["world"], row["trial"], row["level"], _two(row, "warned_after", "fault_after"),
                       _two(row, "pitch_px", "true_pitch_px"), _two(row, "depth_mm", "true_depth_mm"),
                       _two(row, "shift_mm", "shift_off_mm"), ", ".join(errors))
@@ -216,6 +225,10 @@ def tables(run: dict[str, Any]) -> tuple[Table, Table]:
         still.add_row(row["world"], str(row["cycles"]), str(row["warnings"]), str(row["largest_off_px"]),
                       str(row["largest_depth_mm"]), str(row["largest_shift_mm"]))
     return found, still
+
+
+def _depth(errors: Errors | None) -> str:
+    return "-" if errors is None or errors["depth_error_mm"] is None else f"{errors['depth_error_mm']:.3f}"
 
 
 def _two(row: dict[str, Any], first: str, second: str) -> str:
@@ -232,4 +245,4 @@ def _px(value: float) -> float | None:
 
 
 def _mm(metres: float) -> float | None:
-    return round(1000 * float(metres), 3) if np.isfinite(metres) else None
+    return round(1000 * float(metres), 4) if np.isfinite(metres) else None

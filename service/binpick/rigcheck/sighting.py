@@ -11,8 +11,8 @@ from binpick.errors import InputError
 
 Corners: TypeAlias = Float32[np.ndarray, "4 2"]
 _Sides: TypeAlias = Float[np.ndarray, "n 2"]
-WINDOWS = (23, 43)
-"""Neighbourhoods of the threshold, px of half size: a tag's modules, and a tag as a whole under a pattern of dots."""
+WINDOWS = (31, 71)
+"""Neighbourhoods of the threshold, px of half size: as large as a tag, so that its modules and dots on it stay one thing."""
 ALONG = (0.08, 0.92)
 """The part of a side that is looked at: its ends are round in any lens."""
 SAMPLES = 48
@@ -34,6 +34,8 @@ def detect(image: Image, family: str) -> dict[int, Corners]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = WINDOWS
     parameters.adaptiveThreshWinSizeStep = WINDOWS[1] - WINDOWS[0]
+    # a bit is read from the middle of its module, averaged over what dots do to it
+    parameters.perspectiveRemovePixelPerCell, parameters.perspectiveRemoveIgnoredMarginPerCell = 8, 0.2
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     found, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(half)
     if ids is None:
