@@ -19,8 +19,9 @@ FINE_PX = 21
 """The window, at full size, in which the partner is found to a fraction of a pixel."""
 FEWEST = 30
 """Fewer places do not tell a turn from chance."""
-LEAST_TEXTURE = 1e-4
-"""Smallest eigenvalue of a place's gradients, as `cv2.cornerMinEigenVal` scales it: twice what noise alone has."""
+BOTH_WAYS, LEAST_TEXTURE = 0.2, 1e-8
+"""Harris' k, which is above 0 only where gradients one way are not below a quarter of those the other way, and the least of his
+measure, as `cv2.cornerHarris` scales it: an edge that is almost along a row lets partners slide, and rows with them."""
 TUKEY = 4.685
 """Of residuals' spread: places beyond count for nothing (Beaton and Tukey 1974: 95 % efficient on Gaussian noise)."""
 ROUNDS = 8
@@ -116,7 +117,7 @@ def _partners(pair: Rectified) -> tuple[Places, Places]:
 def _textured(image: Image, margin: int) -> Places:
     """The place of each cell with the most texture both ways, away from the window's edges; whole px (x, y)."""
     edge = PATCH_PX // 2 + ROWS_PX // 2 + 2
-    strength = cv2.cornerMinEigenVal(image, PATCH_PX)
+    strength = cv2.cornerHarris(image, PATCH_PX, 3, BOTH_WAYS)
     rows = np.linspace(edge, image.shape[0] - edge, CELLS[1] + 1).astype(int)
     columns = np.linspace(margin + edge, image.shape[1] - edge, CELLS[0] + 1).astype(int)
     places = []
