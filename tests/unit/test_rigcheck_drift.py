@@ -1,6 +1,8 @@
 """Drift is told from pairs and tags whose truth is known: by how much, in which sense, when, and when not."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,7 +22,9 @@ from binpick.rigcheck.rows import Rows
 from binpick.sim import exam
 from binpick.sim.drift import NONE, Drift
 from binpick.sim.projector import Projector
+from binpick.stereo import rectify
 
+MIDDLEBURY = Path(__file__).parents[2] / "../shared/data/middlebury_v3q"
 RIG = exam.rig("A")
 FOCAL_PX = 1740.0
 CALM = Rows(row_px=0.01, sigma_px=0.01, points=120, off_px=0.01, pitch_rad=0.0, roll_rad=0.0, sigma_pitch_rad=1e-5,
@@ -91,6 +95,24 @@ def test_nothing_to_see_is_a_reason_and_no_number() -> None:
     assert np.isnan([seen.row_px, seen.off_px, seen.pitch_rad]).all()
     tiny = replace(pair, left=pair.left[:20].copy(), right=pair.right[:20].copy(), window=replace(pair.window, height=20))
     assert rows.check(tiny).reason
+
+
+@pytest.mark.skipif(not MIDDLEBURY.is_dir(), reason="Middlebury's scenes do not lie in ../shared/data")
+@pytest.mark.parametrize("scene", ["Motorcycle", "Adirondack", "Piano", "Recycle"])
+def test_rows_of_real_pairs_are_off_by_what_their_makers_say(scene: str) -> None:
+    """`dyavg` of a calib.txt is the mean size of the pair's row errors."""
+    said = dict(re.findall(r"(\w+)\s*=\s*\[?\s*([\d.]+)", (MIDDLEBURY / scene / "calib.txt").read_text()))
+    left, right = (cv2.imread(str(MIDDLEBURY / scene / f"im{camera}.png"), cv2.IMREAD_GRAYSCALE) for camera in (0, 1))
+    focal_px = float(said["cam0"])
+
+    def seen(moved: int) -> Rows:
+        pair = rectify.whole(left, np.roll(right, moved, 0), 0, int(said["ndisp"]))
+        return rows.check(replace(pair, focal_px=focal_px, cx_px=left.shape[1] / 2, cy_px=left.shape[0] / 2))
+
+    still = seen(0)
+    assert still.off_px == pytest.approx(float(said["dyavg"]), abs=0.11)
+    for moved in (-6, 3):
+        assert seen(moved).row_px == pytest.approx(still.row_px + moved, abs=0.05)
 
 
 @pytest.mark.parametrize("turn", [Drift(pitch_rad=0.4 / FOCAL_PX), Drift(pitch_rad=-3.0 / FOCAL_PX), Drift(roll_rad=0.001),

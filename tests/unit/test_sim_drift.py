@@ -86,7 +86,7 @@ def test_a_run_is_json_and_tables() -> None:
     told = {"trial": "pitch 3 px", "world": "A", "seed": 1, "pattern": True, "level": "fault", "warned_after": 5,
             "fault_after": 5, "row_px": 3.1, "off_px": 3.1, "pitch_px": 3.003, "true_pitch_px": 3.0, "undrifted": errors,
             "uncorrected": {"depth_error_mm": None, "measured": 0.0}, "by_rows": errors, "by_marks": errors}
-    still = {"world": "A", "seeds": [1], "pattern": True, "cycles": 500, "warnings": 0, "largest_off_px": 0.05,
+    still = {"world": "A", "seeds": [1], "pattern": True, "cycles": 500, "warnings": 0, "largest_row_px": 0.05,
              "largest_depth_mm": 0.1, "largest_shift_mm": 0.1}
     run = {"exam_sha256": exam.sha256(), "trials": [told], "calm": [still]}
     assert json.loads(json.dumps(run)) == run

@@ -194,11 +194,11 @@ def calm(world: str, seeds: Sequence[int], light: Light, cycles: int,
         for cycle in share:
             watch = looked(watch, at, 1000 + cycle, reference)
             levels.append(watch.level)
-            offs.append((watch.off_px, abs(watch.depth_m), watch.shift_m))
+            offs.append((abs(watch.row_px), abs(watch.depth_m), watch.shift_m))
             tick()
     worst = np.nanmax(np.array(offs), axis=0)
     return {"world": world, "seeds": list(seeds), "pattern": light.projector, "cycles": len(levels),
-            "warnings": sum(level is not Level.OK for level in levels), "largest_off_px": _px(worst[0]),
+            "warnings": sum(level is not Level.OK for level in levels), "largest_row_px": _px(worst[0]),
             "largest_depth_mm": _mm(worst[1]), "largest_shift_mm": _mm(worst[2])}
 
 
@@ -222,7 +222,7 @@ def tables(run: dict[str, Any]) -> tuple[Table, Table]:
                       _two(row, "shift_mm", "shift_off_mm"), ", ".join(errors))
     still = Table("world", "cycles without drift", "that warn", "largest row px", "largest depth mm", "largest shift mm")
     for row in run["calm"]:
-        still.add_row(row["world"], str(row["cycles"]), str(row["warnings"]), str(row["largest_off_px"]),
+        still.add_row(row["world"], str(row["cycles"]), str(row["warnings"]), str(row["largest_row_px"]),
                       str(row["largest_depth_mm"]), str(row["largest_shift_mm"]))
     return found, still
 
