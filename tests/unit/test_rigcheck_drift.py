@@ -255,6 +255,18 @@ def test_a_tags_corners_are_where_its_sides_meet(dots: bool, within_px: float) -
     assert not sighting.detect(image, "4x4_50")
 
 
+def test_tags_are_the_same_however_many_threads_look() -> None:
+    image, before = page(dots=True)[0], cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        alone = sighting.detect(image, "apriltag_36h11")
+        cv2.setNumThreads(2)
+        assert {number: corners.tobytes() for number, corners in sighting.detect(image, "apriltag_36h11").items()} == {
+            number: corners.tobytes() for number, corners in alone.items()}
+    finally:
+        cv2.setNumThreads(before)
+
+
 def test_a_family_that_there_is_not() -> None:
     with pytest.raises(InputError, match="apriltag_36h11"):
         sighting.detect(np.zeros((64, 64), np.uint8), "apriltag")
