@@ -32,6 +32,7 @@ def test_the_whole_exam_keeps_its_options_and_names_its_parts(monkeypatch, capsy
 
 @pytest.mark.parametrize(("part", "options"), [
     ("stereo", ("--world", "--scenes", "--tuning", "--repeats", "--middlebury", "--out", "--json")),
+    ("drift", ("--world", "--only", "--calm", "--plain", "--tuning", "--json")),
     ("cameras", ("--pairs", "--only", "--reconnects", "--soak", "--json")),
     ("grasp", ("--world", "--scenes", "--parts", "--clear", "--gate", "--full", "--folder", "--film", "--tuning", "--json")),
 ])
@@ -48,6 +49,8 @@ def test_the_other_parts_have_their_own(monkeypatch, capsys, part, options):
     (("stereo", "--world", "C"), "A, B and all"),
     (("grasp", "--world", "C"), "no exam world 'C'"),
     (("grasp", "--gate", "--full"), "give one of them"),
+    (("drift", "--world", "C"), "A, B and all"),
+    (("drift", "--only", "wind"), "pitch 0.15 px, pitch 0.25 px"),
     (("cameras", "--reconnects", "3", "--soak", "3"), "give one of them"),
     (("grasp", "--film", "bin.gif"), "a film is a .webp file"),
     (("stereo", "--middlebury", "nowhere"), "no Middlebury scenes"),

@@ -241,3 +241,39 @@ def _endure(reconnects: int, soak: float, as_json: bool) -> None:
         typer.echo(json.dumps(run, indent=1))
     else:
         Console(width=150).print(recovery.table(run) if reconnects else lab.table(run))
+
+
+@bench.command()
+def drift(
+    world: Annotated[str, typer.Option(help="A (6 mm lens, 600x400 mm bin), B (12 mm lens, 300x200 mm), or all.")] = "all",
+    only: Annotated[str, typer.Option(help="Trials whose name holds this: pitch, roll, yaw or mount.")] = "",
+    calm: Annotated[int, typer.Option(help="Cycles of a rig that has not drifted, over five bins; 0: none.", min=0,
+                                      max=10000)] = 500,
+    plain: Annotated[bool, typer.Option("--plain", help="Without the projected pattern.")] = False,
+    tuning: Annotated[bool, typer.Option("--tuning", help="Bins of seeds 1 to 5, on which settings are fitted.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Rigs that have drifted by known turns and shifts: whether and when it is noticed, how well it is told and corrected."""
+    import json
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from binpick.errors import InputError
+    from binpick.lab import drift as lab
+    from binpick.sim import exam as frozen
+
+    worlds = [name for name in frozen.SETUPS if world in (name, "all")]
+    if not worlds:
+        raise InputError(f"--world {world}: there are A, B and all")
+    chosen = {name: [trial for trial in lab.trials(name) if only in trial.name] for name in worlds}
+    if only and not any(chosen.values()):
+        raise InputError(f"--only {only}: there are {', '.join(trial.name for trial in lab.trials(worlds[0]))}")
+    seeds = (frozen.TUNING_SEEDS if tuning else frozen.REPORT_SEEDS)[:5]
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("Drifting", total=len(worlds) * calm + lab.CALM * sum(map(len, chosen.values())))
+        run = lab.sit_all(chosen, seeds, lab.light(not plain), calm, lambda: progress.advance(task))
+    if as_json:
+        typer.echo(json.dumps(run, indent=1))
+    else:
+        Console(width=170).print(*lab.tables(run))

@@ -10,7 +10,9 @@ from jaxtyping import Float, Float32, Int
 from binpick import geometry
 from binpick.data import Image, Light
 from binpick.rig import Rig
-from binpick.sim import exam
+from binpick.sim import drift, exam
+from binpick.sim.drift import Drift
+from binpick.sim.marks import Mark, painted
 from binpick.sim.mesh import TABLE_ID, Caster, Hits, Rays, part_mesh
 from binpick.sim.mirror import Mirrored, mirrored
 from binpick.sim.projector import Projector
@@ -55,10 +57,17 @@ class Seen:
 
 
 class Renderer:
-    """Pictures of frozen scenes of one exam world through a rig. Threads may share it."""
+    """Pictures of frozen scenes of one exam world through a rig. Threads may share it.
 
-    def __init__(self, rig: Rig, world: str, optics: exam.Optics = exam.OPTICS) -> None:
-        self._rig, self._world, self._optics = rig, world, optics
+    `drifted`: what has moved since the rig was calibrated; `marks`: tags on the table.
+    """
+
+    def __init__(self, rig: Rig, world: str, optics: exam.Optics = exam.OPTICS, drifted: Drift = drift.NONE,
+                 marks: tuple[Mark, ...] = ()) -> None:
+        self._rig, self._world, self._optics, self._marks = rig, world, optics, marks
+        self._T_camera_bin = exam.setup(world).T_camera_bin
+        if drifted != drift.NONE:
+            self._rig, self._T_camera_bin = drifted.rig(rig), geometry.inverse(drifted.T_was_rig) @ self._T_camera_bin
         self._projector = Projector(world, optics)
         self._lock = threading.Lock()
         self._views: dict[int, View] = {}
@@ -153,7 +162,7 @@ class Renderer:
     def _silhouettes(self, scene: WorldScene, index: int, crop: tuple[slice, slice]) -> Pixels:
         """Pixels of the crop, counted row by row, that can show a part: the hulls of their corners, generously."""
         camera = self._rig.cameras[index]
-        T_cam_bin = camera.T_camera_rig @ exam.setup(self._world).T_camera_bin
+        T_cam_bin = camera.T_camera_rig @ self._T_camera_bin
         mask = np.zeros((crop[0].stop - crop[0].start, crop[1].stop - crop[1].start), np.uint8)
         for part in scene.parts:
             corners = geometry.transform(T_cam_bin @ part.T_bin_part, part_mesh(part.kind).vertices)
@@ -165,17 +174,22 @@ class Renderer:
     def _shaded(self, rays: Rays, hits: Hits, scene: WorldScene) -> Shading:
         points, normals = ends(rays, hits)
         table, index = materials(scene, self._optics), hits.part_id - TABLE_ID
-        return shade(points, normals, -rays[:, 3:], table.reflectance[index], table.gloss[index], self._optics.gloss_power,
+        reflectance = table.reflectance[index]
+        if self._marks:
+            on_table = np.flatnonzero(index == 0)
+            pixel_m = self._T_camera_bin[2, 3] / self._rig.cameras[0].K_px[0, 0]
+            reflectance[on_table] = painted(self._marks, points[on_table], reflectance[on_table], pixel_m)
+        return shade(points, normals, -rays[:, 3:], reflectance, table.gloss[index], self._optics.gloss_power,
                      self._projector, self._optics)
 
     def _rays(self, index: int) -> Float32[np.ndarray, "h w 6"]:
         camera = self._rig.cameras[index]
-        T_cam_bin = camera.T_camera_rig @ exam.setup(self._world).T_camera_bin
+        T_cam_bin = camera.T_camera_rig @ self._T_camera_bin
         return _rays(camera.K_px, camera.distortion_coefficients, T_cam_bin, self._rig.image_size_px)
 
     def _view(self, index: int) -> View:
         setup, camera, size = exam.setup(self._world), self._rig.cameras[index], self._rig.image_size_px
-        T_cam_bin = camera.T_camera_rig @ setup.T_camera_bin
+        T_cam_bin = camera.T_camera_rig @ self._T_camera_bin
         rays = self._rays(index)
         nothing = WorldScene(self._world, (), 0, 0)
         caster = self._cast(nothing)
