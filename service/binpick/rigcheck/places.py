@@ -48,6 +48,22 @@ def refined(seen: Seen, rig: Rig, T_rig_board: Transform) -> Transform:
     return moved(T_rig_board, step)
 
 
+def information(seen: Seen, rig: Rig, T_rig_board: Transform, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
+    """How well the images tell the board's turn (about its middle) and way, in the rig's frame: the inverse covariance for
+    points that err by 1 px along each axis."""
+    to_middle = geometry.make(np.eye(3), middle)
+    columns = []
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = 1e-5
+        both = [misplaced_px(seen, rig, moved(T_rig_board @ to_middle, sign * step) @ geometry.inverse(to_middle)).ravel()
+                for sign in (1, -1)]
+        columns.append((both[0] - both[1]) / 2e-5)
+    slopes = np.column_stack(columns)
+    told: Float[np.ndarray, "6 6"] = slopes.T @ slopes
+    return told
+
+
 def places(seen: Seen, rig: Rig) -> list[Transform]:
     """T_rig_board of every place that explains the points, the best first; at least one camera sees the board.
 
