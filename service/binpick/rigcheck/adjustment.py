@@ -6,16 +6,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from binpick import geometry
-from binpick.geometry import Transform
-from binpick.rigcheck import loop, places
+from binpick.geometry import Transform, Vector
+from binpick.rigcheck import places
 from binpick.rigcheck.board import Board
 
 ROUNDS = 6
 """Of weights and fit in turn; the weights stand after three or four."""
 LEAST_RAD, LEAST_M, LEAST_PX = np.radians(0.005), 0.00003, 0.02
 """Nothing errs by less."""
+
+Turns = Float[np.ndarray, "n 3 3"]
+Ways = Float[np.ndarray, "n 3"]
 
 
 class Loop(NamedTuple):
@@ -45,11 +49,17 @@ class View(NamedTuple):
     rms_px: float
 
 
-class Errors(NamedTuple):
-    """One deviation of the robot's poses, along and about each axis."""
+class Adjusted(NamedTuple):
+    """The answer, and the covariance of T_mount_rig: turn about its origin and way, in the mount's frame."""
 
-    m: float
-    rad: float
+    loop: Loop
+    covariance: Float[np.ndarray, "6 6"]
+
+    def sigma(self, there: Vector) -> tuple[float, float]:
+        """One deviation, over all axes together, of the place of a point of the rig's frame, m, and of its turn, rad."""
+        x, y, z = geometry.rotate(self.loop.T_mount_rig, there)
+        moves = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
+        return (float(np.sqrt(np.trace(moves @ self.covariance @ moves.T))), float(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
 
 def corners(board: Board) -> Float[np.ndarray, "4 3"]:
@@ -57,13 +67,18 @@ def corners(board: Board) -> Float[np.ndarray, "4 3"]:
     return board.points_m.astype(np.float64)[[0, board.columns - 1, -board.columns, -1]]
 
 
-def apart(view: View, expected: Transform, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6"]:
-    """Turn and way of the board's middle from where it is seen to where it is expected, in the rig's frame."""
-    way = geometry.transform(expected, middle) - geometry.transform(view.T_rig_board, middle)
-    return np.concatenate([loop.turn(expected[:3, :3] @ view.T_rig_board[:3, :3].T), way])
+def apart(views: Sequence[View], found: Loop, middle: Vector) -> Float[np.ndarray, "n 6"]:
+    """Turn and way of the board's middle from where it is seen to where the robot puts it, in the rig's frame."""
+    seen = np.array([view.T_rig_board for view in views])
+    T_carrier_rig = np.array([view.T_carrier_mount for view in views]) @ found.T_mount_rig
+    R_rig_carrier = T_carrier_rig[:, :3, :3].transpose(0, 2, 1)
+    ahead = geometry.transform(found.T_carrier_board, middle) - T_carrier_rig[:, :3, 3]
+    way = np.einsum("nij,nj->ni", R_rig_carrier, ahead) - (seen[:, :3, :3] @ middle + seen[:, :3, 3])
+    turn = Rotation.from_matrix(R_rig_carrier @ found.T_carrier_board[:3, :3] @ seen[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+    return np.hstack([turn, way])
 
 
-def adjusted(views: Sequence[View], start: Loop, board: Board, upright: bool) -> Loop:
+def adjusted(views: Sequence[View], start: Loop, board: Board, upright: bool) -> Adjusted:
     """The least squares over the samples' turns and ways, each weighed by how well its images and the robot tell it.
 
     What a corner errs by is read off the boards' own fits; what the robot errs by is what is left over, in turn with the fit.
@@ -73,54 +88,44 @@ def adjusted(views: Sequence[View], start: Loop, board: Board, upright: bool) ->
     middle = corners(board).mean(0)
     free = [i for i in range(12) if not (upright and i == 11)]
     image_px = max(LEAST_PX, float(np.sqrt(np.mean([view.rms_px**2 for view in views]) / 2)))
-    blur = [image_px**2 * np.linalg.inv(view.information) for view in views]
-    found = start
+    blur = image_px**2 * np.linalg.inv(np.array([view.information for view in views]))
+    found, covariance = start, np.zeros((6, 6))
     for _ in range(ROUNDS):
-        errors = _errors(views, found, blur, middle, len(free))
-        weights = [np.linalg.inv(np.linalg.cholesky(b + _robot(view, found, errors, middle)))
-                   for view, b in zip(views, blur, strict=True)]
-        found = _step(views, found, weights, middle, free)
-    return found
+        weights = np.linalg.inv(np.linalg.cholesky(blur + _robot(views, found, blur, middle, len(free))))
+        found, covariance = _step(views, found, weights, middle, free)
+    return Adjusted(found, covariance)
 
 
-def _errors(views: Sequence[View], found: Loop, blur: Sequence[Float[np.ndarray, "6 6"]], middle: Float[np.ndarray, "3"],
-            unknowns: int) -> Errors:
-    """The robot's, by moments: what is left over, less the images' share, and of the ways less the turns' by their lever."""
-    off = np.array([apart(view, found.T_rig_board(view.T_carrier_mount), middle) for view in views])
+def _robot(views: Sequence[View], found: Loop, blur: Float[np.ndarray, "n 6 6"], middle: Vector,
+           unknowns: int) -> Float[np.ndarray, "n 6 6"]:
+    """What the robot's errors make of the boards' turns and ways; they turn about the flange.
+
+    Of what is left over, less the images' share: the turns tell its angles, the ways less these by their lever its places.
+    """
+    off = apart(views, found, middle)
     fair = off.size / max(1, off.size - unknowns)
-    turn2 = fair * (off[:, :3]**2).sum(1).mean() - np.mean([np.trace(b[:3, :3]) for b in blur])
-    robot_rad = float(np.sqrt(max(LEAST_RAD**2, turn2 / 3)))
-    lever2 = np.mean([2 * (_lever(view, found, middle)**2).sum() for view in views]) * robot_rad**2
-    way2 = fair * (off[:, 3:]**2).sum(1).mean() - np.mean([np.trace(b[3:, 3:]) for b in blur]) - lever2
-    return Errors(float(np.sqrt(max(LEAST_M**2, way2 / 3))), robot_rad)
-
-
-def _lever(view: View, found: Loop, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """From the flange to the board's middle, in the rig's frame."""
-    flange = geometry.inverse(found.T_mount_rig) @ view.T_mount_flange
-    lever: Float[np.ndarray, "3"] = geometry.transform(view.T_rig_board, middle) - flange[:3, 3]
-    return lever
-
-
-def _robot(view: View, found: Loop, errors: Errors, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
-    """What the robot's errors make of a board's turn and way: it turns about the flange."""
-    x, y, z = _lever(view, found, middle)
-    by_turn = np.vstack([np.eye(3), np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])])
-    covariance: Float[np.ndarray, "6 6"] = errors.rad**2 * by_turn @ by_turn.T
-    covariance[3:, 3:] += errors.m**2 * np.eye(3)
+    left_rad, left_m = (fair * (off[:, part]**2).sum(1).mean() - np.trace(blur[:, part, part], axis1=1, axis2=2).mean()
+                        for part in (slice(3), slice(3, 6)))
+    rad2 = max(LEAST_RAD**2, left_rad / 3)
+    T_rig_mount = geometry.inverse(found.T_mount_rig)
+    lever = np.array([geometry.transform(view.T_rig_board, middle) - (T_rig_mount @ view.T_mount_flange)[:3, 3]
+                      for view in views])
+    m2 = max(LEAST_M**2, (left_m - 2 * rad2 * (lever**2).sum(1).mean()) / 3)
+    by_turn = np.zeros((len(views), 6, 3))
+    by_turn[:, :3] = np.eye(3)
+    by_turn[:, 3:] = np.cross(np.eye(3)[None], lever[:, None]).transpose(0, 2, 1)
+    covariance: Float[np.ndarray, "n 6 6"] = rad2 * by_turn @ by_turn.transpose(0, 2, 1)
+    covariance[:, 3:, 3:] += m2 * np.eye(3)
     return covariance
 
 
-def _step(views: Sequence[View], start: Loop, weights: Sequence[Float[np.ndarray, "6 6"]], middle: Float[np.ndarray, "3"],
-          free: Sequence[int]) -> Loop:
+def _step(views: Sequence[View], start: Loop, weights: Float[np.ndarray, "n 6 6"], middle: Vector,
+          free: Sequence[int]) -> Adjusted:
     def at(x: Float[np.ndarray, "u"]) -> Loop:
         step = np.zeros(12)
         step[list(free)] = x
         return Loop(places.moved(start.T_mount_rig, step[:6]), places.moved(start.T_carrier_board, step[6:]))
 
-    def residuals(x: Float[np.ndarray, "u"]) -> Float[np.ndarray, "r"]:
-        now = at(x)
-        return np.concatenate([w @ apart(view, now.T_rig_board(view.T_carrier_mount), middle)
-                               for view, w in zip(views, weights, strict=True)])
-
-    return at(least_squares(residuals, np.zeros(len(free)), method="lm").x)
+    fit = least_squares(lambda x: np.einsum("nij,nj->ni", weights, apart(views, at(x), middle)).ravel(), np.zeros(len(free)),
+                        method="lm")
+    return Adjusted(at(fit.x), np.linalg.inv(fit.jac.T @ fit.jac)[:6, :6])

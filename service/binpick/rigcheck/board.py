@@ -67,8 +67,8 @@ class Board:
     def turns(self) -> tuple[Int32[np.ndarray, "n"], ...]:
         """The other numberings under which the board looks the same: ids of the points that stand in each point's place.
 
-        Empty for a board that shows which way it lies: a ChArUco, a tag, a chessboard with one odd and one even count, asymmetric
-        circles. The others have a half turn, a square grid of dots the quarter turns, too.
+        Empty for a board that shows which way it lies: a ChArUco, a tag, a chessboard with one odd and one even count,
+        asymmetric circles. The others have a half turn, a square grid of dots the quarter turns, too.
         """
         if self.kind in (Kind.CHARUCO, Kind.TAG) or (self.kind is Kind.CHESSBOARD and (self.columns + self.rows) % 2):
             return ()

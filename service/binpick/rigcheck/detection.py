@@ -97,8 +97,8 @@ def edges(image: Image, board: Board, ids: Int32[np.ndarray, "n"],
     """Sigma of the board's edges, px, and its contrast, grey levels: medians over profiles between neighbouring points.
 
     Of rows and columns the softer counts: a hand moves a board one way, and across that way the edges stay sharp. Between two
-    corners of a chessboard the edge is crossed at half way, square to it, as is the side of a tag; between two dots the profile leaves the one and
-    enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
+    corners of a chessboard or tag the edge is crossed at half way, square to it; between two dots the profile leaves the one
+    and enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
     """
     pairs = neighbours(board, ids)
     in_row = ids[pairs[:, 1]] - ids[pairs[:, 0]] == 1

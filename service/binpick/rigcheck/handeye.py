@@ -12,7 +12,7 @@ from binpick.errors import InputError
 from binpick.geometry import Transform
 from binpick.rig import Rig
 from binpick.rigcheck import loop, places, spread
-from binpick.rigcheck.adjustment import Loop, View, adjusted, apart, corners
+from binpick.rigcheck.adjustment import Adjusted, Loop, View, adjusted, apart, corners
 from binpick.rigcheck.board import Board
 from binpick.rigcheck.detection import Detection
 
@@ -56,8 +56,8 @@ class HandEye:
 
     `T_carrier_board`: the board on what carries it: on the flange for a rig on the base, else in the base. `rms_m`, `rms_rad`
     and `rms_px` are of the samples used. `sigma_m`, `sigma_rad`: one deviation of the place of what lies where the boards were,
-    and of its turn, by leaving out one sample at a time: small residuals do not tell that the samples were alike. `residuals`
-    are of all samples in which the board was seen, by name; `outliers` say which were left out, and why.
+    and of its turn, by the scatter of the samples: small residuals do not tell that the samples were too much alike.
+    `residuals` are of all samples in which the board was seen, by name; `outliers` say which were left out, and why.
     """
 
     mounting: Mounting
@@ -88,19 +88,20 @@ class _Case:
 
     def closed(self, views: Sequence[View]) -> Loop:
         """The closed form's answer; raised to the given height where it leaves the height open."""
-        A, C = [view.T_carrier_mount for view in views], [view.T_rig_board for view in views]
-        X = loop.best(A, C, self.solver)
-        if X is None:
+        mounts, boards = [view.T_carrier_mount for view in views], [view.T_rig_board for view in views]
+        T_mount_rig = loop.best(mounts, boards, self.solver)
+        if T_mount_rig is None:
             raise InputError("no transform fits the samples: check the robot's poses")
         if self.z_m is not None:
-            axis = loop.spread_rad(A)[1][0]
-            lift = (self.z_m - loop.middle(A, X, C)[2, 3]) / float(np.mean([(a[:3, :3] @ axis)[2] for a in A]))
-            X = geometry.make(X[:3, :3], X[:3, 3] + lift * axis)
-        return Loop(X, loop.middle(A, X, C))
+            axis = loop.spread_rad(mounts)[1][0]
+            lift = (self.z_m - loop.middle(mounts, T_mount_rig, boards)[2, 3]) / float(np.mean([(T[:3, :3] @ axis)[2]
+                                                                                               for T in mounts]))
+            T_mount_rig = geometry.make(T_mount_rig[:3, :3], T_mount_rig[:3, 3] + lift * axis)
+        return Loop(T_mount_rig, loop.middle(mounts, T_mount_rig, boards))
 
-    def fitted(self, views: Sequence[View], start: Loop) -> Loop:
+    def fitted(self, views: Sequence[View]) -> Adjusted:
         """The answer of some samples."""
-        return adjusted(views, start, self.board, self.z_m is not None)
+        return adjusted(views, self.closed(views), self.board, self.z_m is not None)
 
     def apart_m(self, T_carrier_mount: Transform, view: View, found: Loop) -> float:
         """Rms distance of the board's outer points from where a robot pose puts them."""
@@ -121,7 +122,8 @@ def solve(samples: Sequence[Sample], rig: Rig, mounting: Mounting, z_m: float | 
     if fault := spread.fault([sample.T_base_flange for sample in seen], z_m is not None):
         raise InputError(fault)
     views, apart_m = _views(seen, case)
-    used, found = _agreed(views, apart_m, case)
+    used, answer = _agreed(views, apart_m, case)
+    found = answer.loop
     numbers = {view.name: i for i, view in enumerate(views)}
     residuals = {view.name: _residual(view, seen[i], found, case) for i, view in enumerate(views)}
     kept = [residual for name, residual in residuals.items() if numbers[name] in used]
@@ -133,7 +135,8 @@ def solve(samples: Sequence[Sample], rig: Rig, mounting: Mounting, z_m: float | 
     outliers = {sample.name: "no camera sees the board" for sample in samples if not any(sample.seen)}
     outliers |= {view.name: _why(view, views_used, found, residuals[view.name], rms_m, case)
                  for i, view in enumerate(views) if i not in used}
-    sigma_m, sigma_rad = _sigma(views_used, found, case)
+    middle = corners(case.board).mean(0)
+    sigma_m, sigma_rad = answer.sigma(np.mean([geometry.transform(view.T_rig_board, middle) for view in views_used], axis=0))
     T_base_rig, T_flange_rig = (found.T_mount_rig, None) if mounting == "base" else (None, found.T_mount_rig)
     return HandEye(mounting, T_base_rig, T_flange_rig, found.T_carrier_board, rms_m, rms_rad, rms_px, sigma_m, sigma_rad,
                    residuals, outliers)
@@ -151,30 +154,29 @@ def _board(seen: Sequence[Sample]) -> Board:
 
 def _views(seen: Sequence[Sample], case: _Case) -> tuple[list[View], Float[np.ndarray, "n"]]:
     """The samples with the places and numberings that agree best, and how far each then lies from the one in their middle."""
-    A = [sample.T_base_flange if case.mounting == "flange" else geometry.inverse(sample.T_base_flange) for sample in seen]
+    mounts = [sample.T_base_flange if case.mounting == "flange" else geometry.inverse(sample.T_base_flange) for sample in seen]
     turns = places.turned(case.board)
     ways = [[(place, turn) for place in places.places(sample.seen, case.rig) for turn in turns] for sample in seen]
     points = corners(case.board)
-    guess = loop.guess(A, [[place @ geometry.inverse(turn) for place, turn in some] for some in ways], case.solver, points)
+    guess = loop.guess(mounts, [[place @ geometry.inverse(turn) for place, turn in some] for some in ways], case.solver, points)
     if guess is None:
         raise InputError("no transform fits the samples: check the robot's poses")
     views = []
-    for sample, a, some, k in zip(seen, A, ways, guess.chosen, strict=True):
+    for sample, mount, some, k in zip(seen, mounts, ways, guess.chosen, strict=True):
         place, turn = some[k]
         T_mount_flange = np.eye(4) if case.mounting == "flange" else sample.T_base_flange
-        views.append(View(sample.name, a, T_mount_flange, place @ geometry.inverse(turn),
+        views.append(View(sample.name, mount, T_mount_flange, place @ geometry.inverse(turn),
                           places.information(sample.seen, case.rig, place, geometry.transform(turn, points.mean(0))),
                           places.rms_px(sample.seen, case.rig, place)))
     return views, guess.apart_m
 
 
-def _agreed(views: Sequence[View], apart_m: Float[np.ndarray, "n"], case: _Case) -> tuple[list[int], Loop]:
+def _agreed(views: Sequence[View], apart_m: Float[np.ndarray, "n"], case: _Case) -> tuple[list[int], Adjusted]:
     """The samples that agree, and what they agree on: fitted to them, judged by it, until both stand."""
     used = _near(apart_m)
     for _ in range(ROUNDS):
-        some = [views[i] for i in used]
-        found = case.fitted(some, case.closed(some))
-        before, used = used, _near(np.array([case.apart_m(view.T_carrier_mount, view, found) for view in views]))
+        found = case.fitted([views[i] for i in used])
+        before, used = used, _near(np.array([case.apart_m(view.T_carrier_mount, view, found.loop) for view in views]))
         if used == before:
             break
     return before, found
@@ -189,26 +191,16 @@ def _near(apart_m: Float[np.ndarray, "n"]) -> list[int]:
 
 def _residual(view: View, sample: Sample, found: Loop, case: _Case) -> Residual:
     expected = found.T_rig_board(view.T_carrier_mount)
-    off = apart(view, expected, corners(case.board).mean(0))
+    off = apart([view], found, corners(case.board).mean(0))[0]
     numbered = [expected @ turn for turn in places.turned(case.board)]
     return Residual(float(np.linalg.norm(off[3:])), float(np.linalg.norm(off[:3])),
                     min(places.rms_px(sample.seen, case.rig, T) for T in numbered))
 
 
-def _sigma(views: Sequence[View], found: Loop, case: _Case) -> tuple[float, float]:
-    """The jackknife: what each sample moves the answer by, at the boards' middle."""
-    middle = np.mean([geometry.transform(view.T_rig_board, corners(case.board).mean(0)) for view in views], axis=0)
-    without = [case.fitted([other for other in views if other is not view], found).T_mount_rig for view in views]
-    there = np.array([geometry.transform(X, middle) for X in without])
-    turns = np.array([loop.turn(X[:3, :3] @ found.T_mount_rig[:3, :3].T) for X in without])
-    spread_m, spread_rad = (float(np.sqrt((len(views) - 1) * np.var(each, axis=0).sum())) for each in (there, turns))
-    return spread_m, spread_rad
-
-
 def _why(view: View, used: Sequence[View], found: Loop, residual: Residual, rms_m: float, case: _Case) -> str:
     """Why a sample is left out: what would explain it, else by how much it is off."""
-    off = (f"its board lies {1000 * residual.m:.1f} mm and {np.degrees(residual.rad):.1f} degrees from where its robot pose puts "
-           f"it, those of the others {1000 * rms_m:.1f} mm (rms)")
+    off = (f"its board lies {1000 * residual.m:.1f} mm and {np.degrees(residual.rad):.1f} degrees from where its robot pose "
+           f"puts it, those of the others {1000 * rms_m:.1f} mm (rms)")
     nearest, other = min((case.apart_m(each.T_carrier_mount, view, found), each.name) for each in used)
     if nearest < OUTLYING * max(PRECISE_M, rms_m):
         return f"{off}; the pose of {other} would fit it"
@@ -223,7 +215,7 @@ def _disagreement(views: Sequence[View], used: Sequence[int], rms_m: float, case
     other = loop.guess([geometry.inverse(view.T_carrier_mount) for view in views], [[view.T_rig_board] for view in views],
                        case.solver, corners(case.board))
     if other is not None and other.score_m < min(WORST_M, rms_m / 3):
-        return told + (f"With the rig mounted the other way, on flange or base, they agree to {1000 * other.score_m:.1f} mm: check "
-                       "the mounting, and that the poses are those of the flange in the base")
-    return told + ("Check that each pose belongs to its images, that it is the flange's (no tool set), its unit and its kind of "
-                   "angles, the board's size, and that rig and board sit tight")
+        return told + (f"With the rig mounted the other way, on flange or base, they agree to {1000 * other.score_m:.1f} mm: "
+                       "check the mounting, and that the poses are those of the flange in the base")
+    return told + ("Check that each pose belongs to its images, that it is the flange's (no tool set), its unit and its kind "
+                   "of angles, the board's size, and that rig and board sit tight")

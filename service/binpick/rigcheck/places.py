@@ -16,7 +16,8 @@ from binpick.rigcheck.detection import Detection
 Seen = Sequence[Detection | None]
 """What each camera of the rig sees, in its order."""
 AS_GOOD = 3.0
-"""A flat board seen from afar may be tilted either way: a second place counts while it misses by less than so many times the first."""
+"""A flat board seen from afar may be tilted either way: a second place counts while it misses by less than so many times as
+much as the first."""
 
 
 def misplaced_px(seen: Seen, rig: Rig, T_rig_board: Transform) -> Float[np.ndarray, "n 2"]:
@@ -67,14 +68,16 @@ def information(seen: Seen, rig: Rig, T_rig_board: Transform, middle: Float[np.n
 def places(seen: Seen, rig: Rig) -> list[Transform]:
     """T_rig_board of every place that explains the points, the best first; at least one camera sees the board.
 
-    There are two when the board may be tilted either way. Turns of a board whose ends look alike are not among them.
+    There are two when the board may be tilted either way; the first camera that sees it tells them. Turns of a board whose ends
+    look alike are not among them.
     """
     found: list[tuple[float, Transform]] = []
     for detection, camera in zip(seen, rig.cameras, strict=False):
-        if detection is None:
+        if detection is None or found:
             continue
-        _, turns, shifts, _ = cv2.solvePnPGeneric(detection.points_m.astype(np.float64), detection.corners_px.astype(np.float64),
-                                                  camera.K_px, camera.distortion_coefficients, flags=cv2.SOLVEPNP_IPPE)
+        points, px = detection.points_m.astype(np.float64), detection.corners_px.astype(np.float64)
+        _, turns, shifts, _ = cv2.solvePnPGeneric(points, px, camera.K_px, camera.distortion_coefficients,
+                                                  flags=cv2.SOLVEPNP_IPPE)
         for r, t in zip(turns, shifts, strict=True):
             T = refined(seen, rig, geometry.inverse(camera.T_camera_rig) @ geometry.make(cv2.Rodrigues(r)[0], t[:, 0]))
             if all(np.abs(T[:3, :3] - other[:3, :3]).max() > 0.01 for _, other in found):

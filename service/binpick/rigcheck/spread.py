@@ -31,8 +31,8 @@ def fault(T_base_flange: Sequence[Transform], upright: bool) -> str | None:
     if upright:
         return _upright_fault(T_base_flange, float(second), f"{turned} and {np.degrees(second):.0f} about others")
     if second < LEAST_RAD:
-        return (f"{turned}, but only by {np.degrees(second):.1f} about other axes: add samples tilted by 20 to 40 degrees about "
-                f"its {others}; of a robot with four axes, which cannot, give the height z")
+        return (f"{turned}, but only by {np.degrees(second):.1f} about other axes: add samples tilted by 20 to 40 degrees "
+                f"about its {others}; of a robot with four axes, which cannot, give the height z")
     return None
 
 
