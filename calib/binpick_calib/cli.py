@@ -124,6 +124,35 @@ def hand_eye(
         typer.echo(f"Written: {out}")
 
 
+@app.command("bin")
+def carrier(
+    points: Annotated[Path | None, typer.Option(metavar="FILE", help="Points touched, in the robot's base, .csv: name,x_mm,"
+                                                "y_mm,z_mm; three or four named rim (inner corners), one floor.")] = None,
+    size: Annotated[str, typer.Option(metavar="LxWxH", help="Inner size, metres: 0.6x0.4x0.18; or give --cell.")] = "",
+    unit: Annotated[Literal["", "mm", "m"], typer.Option(help="Of the points, where the head does not tell.")] = "",
+    locate: Annotated[bool, typer.Option("--locate", help="Instead of points: see the rim in a pair of images.")] = False,
+    left: Annotated[Path | None, typer.Option(metavar="FILE", help="The left image.")] = None,
+    right: Annotated[Path | None, typer.Option(metavar="FILE", help="The right image.")] = None,
+    rig: Annotated[Path | None, typer.Option(metavar="FILE", help="The rig file.")] = None,
+    cell: Annotated[Path | None, typer.Option(metavar="FILE", help="The cell file: the bin's size and rough place.")] = None,
+    number: Annotated[int, typer.Option("--bin", min=1, max=65535, help="Which bin of the cell file.")] = 1,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it there; else it is printed.")] = None,
+) -> None:
+    """Find where a bin stands, as the `bin:` of a cell file.
+
+    Touched with the robot: the tool's tip in three inner corners of the rim and on the floor. Or
+    with --locate by its rim in a pair of images, near where the cell file has it.
+    """
+    from binpick_calib import bin as bins
+
+    found = bins.run(points, size, unit, (left, right, rig) if locate else None, cell, number)
+    if out is None:
+        typer.echo(found, nl=False)
+    else:
+        _write(out, found.encode())
+        typer.echo(f"Written: {out}")
+
+
 @app.command("board")
 def print_board(
     board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as solve is told it: chessboard:9x6:0.025, "

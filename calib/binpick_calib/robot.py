@@ -54,11 +54,7 @@ class Table:
 
 def read(path: Path, told: PoseFormat | None = None, unit: str = "") -> Table:
     """The poses of a .csv, .txt, .yaml or .yml file. Raises InputError that names file, line and what is expected."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the robot poses cannot be read: {getattr(error, 'strerror', error)}") from error
-    table = _of_yaml(path, text) if path.suffix.lower() in (".yaml", ".yml") else _of_csv(path, text, told, unit)
+    table = _of_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else _of_csv(path, told, unit)
     if not table.rows:
         raise InputError(f"{path}: there is no pose in it")
     for row in table.rows:
@@ -69,11 +65,41 @@ def read(path: Path, told: PoseFormat | None = None, unit: str = "") -> Table:
     return table
 
 
-def _of_csv(path: Path, text: str, told: PoseFormat | None, unit: str) -> Table:
-    cells = [(line, _cells(written)) for line, written in enumerate(text.splitlines(), start=1)
+def points(path: Path, unit: str = "") -> tuple[Row, ...]:
+    """Named points of a .csv with the columns name, x, y, z. Raises InputError as `read` does."""
+    cells = _lines(path)
+    head = [_head(cell) for cell in cells[0][1]]
+    names = [name for name, _ in head]
+    if not {"name", "x", "y", "z"} <= set(names):
+        raise InputError(f"{path}:{cells[0][0]}: the first line must name the columns: name,x_mm,y_mm,z_mm")
+    unit_m = _unit_m(path, dict(head)["x"] or unit)
+    rows = []
+    for line, row in cells[1:]:
+        if len(row) != len(head):
+            raise InputError(f"{path}:{line}: {len(row)} columns, the head has {len(head)}")
+        rows.append(Row(row[names.index("name")], line,
+                        tuple(unit_m * _number(path, line, row[names.index(axis)]) for axis in "xyz"), ()))
+    return tuple(rows)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the table cannot be read: {getattr(error, 'strerror', error)}") from error
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """The cells of each line that says something, with its number."""
+    cells = [(line, _cells(written)) for line, written in enumerate(_text(path).splitlines(), start=1)
              if written.strip() and not written.lstrip().startswith("#")]
     if not cells:
-        raise InputError(f"{path}: there is no pose in it")
+        raise InputError(f"{path}: there is nothing in it")
+    return cells
+
+
+def _of_csv(path: Path, told: PoseFormat | None, unit: str) -> Table:
+    cells = _lines(path)
     head = [_head(cell) for cell in cells[0][1]]
     if "x" not in [name for name, _ in head]:
         return _without_head(path, cells, told, unit)
@@ -117,10 +143,10 @@ def _without_head(path: Path, cells: Sequence[tuple[int, list[str]]], told: Pose
     return Table(path, tuple(rows), told, len(cells[0][1]) > count)
 
 
-def _of_yaml(path: Path, text: str) -> Table:
+def _of_yaml(path: Path) -> Table:
     """A list of mappings: a name, position_m or position_mm, and one orientation as in the cell file."""
     try:
-        document = yaml.safe_load(text)
+        document = yaml.safe_load(_text(path))
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not YAML: {getattr(error, 'problem', error)}") from error
     if not isinstance(document, list) or not all(isinstance(entry, dict) for entry in document):

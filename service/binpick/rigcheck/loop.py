@@ -10,7 +10,7 @@ from itertools import combinations, islice, product
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from binpick import geometry
@@ -98,7 +98,7 @@ def spread_rad(mounts: Transforms) -> tuple[Vector, Float[np.ndarray, "3 3"]]:
     """Root mean square turn between two samples about three axes, the most first, and the axes (rows) in the mount's frame."""
     turns = np.array([of_mount for of_mount, _ in _turns(mounts, mounts)])
     values, axes = np.linalg.eigh(turns.T @ turns / len(turns))
-    return np.sqrt(np.clip(values[::-1], 0, None)), axes.T[::-1]
+    return np.sqrt(np.clip(values[::-1], 0, None)), np.ascontiguousarray(axes.T[::-1])
 
 
 def middle(mounts: Transforms, T_mount_rig: Transform, boards: Transforms) -> Transform:
@@ -122,9 +122,13 @@ def guess(mounts: Transforms, places: Sequence[Transforms], solver: Solver, corn
     `places` are the T_rig_board in which each sample's board may be seen; `corners` of the board are what is compared.
     """
     found = None
+    owner = np.repeat(np.arange(len(mounts)), [len(some) for some in places])
+    all_mounts, all_boards = np.array(mounts)[owner], np.array([T for some in places for T in some])
     for some, chosen in _sets(mounts, places):
-        for T_mount_rig in solver([mounts[i] for i in some], [places[i][k] for i, k in zip(some, chosen, strict=True)]):
-            tried = _judged(T_mount_rig, mounts, places, corners)
+        solved = solver([mounts[i] for i in some], [places[i][k] for i, k in zip(some, chosen, strict=True)])
+        # the methods differ by noise, which a three has too much of anyway
+        for T_mount_rig in islice(solved, 1 if len(some) == 3 else None):
+            tried = _judged(T_mount_rig, owner, all_mounts, all_boards, corners)
             if found is None or tried.score_m < found.score_m:
                 found = tried
     return found
@@ -144,14 +148,13 @@ def _sets(mounts: Transforms, places: Sequence[Transforms]) -> Iterator[tuple[tu
             yield three, chosen
 
 
-def _judged(T_mount_rig: Transform, mounts: Transforms, places: Sequence[Transforms],
-            corners: Float[np.ndarray, "k 3"]) -> Guess:
+def _judged(T_mount_rig: Transform, owner: Int[np.ndarray, "m"], mounts: Float[np.ndarray, "m 4 4"],
+            places: Float[np.ndarray, "m 4 4"], corners: Float[np.ndarray, "k 3"]) -> Guess:
     """The guess with every board in the place nearest to the one that lies in their middle."""
-    owner = np.concatenate([[i] * len(some) for i, some in enumerate(places)])
-    boards = np.array([geometry.transform(mount @ T_mount_rig @ place, corners)
-                       for mount, some in zip(mounts, places, strict=True) for place in some])
+    whole = mounts @ T_mount_rig @ places
+    boards = corners @ whole[:, :3, :3].transpose(0, 2, 1) + whole[:, None, :3, 3]
     apart = np.sqrt(((boards[:, None] - boards)**2).sum(3).mean(2))
     nearest = np.minimum.reduceat(apart, np.flatnonzero(np.diff(owner, prepend=-1)), axis=1)
     central = int(np.argmin(np.median(nearest, axis=1)))
-    chosen = tuple(int(np.argmin(apart[central, owner == i])) for i in range(len(mounts)))
+    chosen = tuple(int(np.argmin(apart[central, owner == i])) for i in range(nearest.shape[1]))
     return Guess(T_mount_rig, chosen, nearest[central])

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from binpick import geometry
-from binpick.geometry import Transform
+from binpick.geometry import Transform, Vector
 from binpick.rig import Rig
 from binpick.rigcheck.board import Board
 from binpick.rigcheck.detection import Detection
@@ -22,14 +22,23 @@ much as the first."""
 
 def misplaced_px(seen: Seen, rig: Rig, T_rig_board: Transform) -> Float[np.ndarray, "n 2"]:
     """Where the cameras would see the board's points, less where they saw them; one row for each point and camera."""
-    rows = []
+    return _misplaced(seen, rig, T_rig_board, T_rig_board[:3, 3])[0]
+
+
+def _misplaced(seen: Seen, rig: Rig, T_rig_board: Transform, about: Vector) -> tuple[Float[np.ndarray, "n 2"],
+                                                                                    Float[np.ndarray, "m 6"]]:
+    """And the slopes of its numbers over a turn about a point and a way, both in the rig's frame."""
+    rows, slopes = [], []
     for detection, camera in zip(seen, rig.cameras, strict=False):
         if detection is not None:
-            T = camera.T_camera_rig @ T_rig_board
-            px = cv2.projectPoints(detection.points_m.astype(np.float64), cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], camera.K_px,
-                                   camera.distortion_coefficients)[0][:, 0]
-            rows.append(px - detection.corners_px)
-    return np.concatenate(rows)
+            T = camera.T_camera_rig
+            in_rig = detection.points_m.astype(np.float64) @ T_rig_board[:3, :3].T + T_rig_board[:3, 3]
+            px, by = cv2.projectPoints(in_rig @ T[:3, :3].T + T[:3, 3], np.zeros(3), np.zeros(3), camera.K_px,
+                                       camera.distortion_coefficients)
+            rows.append(px[:, 0] - detection.corners_px)
+            by_way = by[:, 3:6] @ T[:3, :3]
+            slopes.append(np.hstack([np.cross(np.repeat(in_rig - about, 2, axis=0), by_way), by_way]))
+    return np.concatenate(rows), np.concatenate(slopes)
 
 
 def rms_px(seen: Seen, rig: Rig, T_rig_board: Transform) -> float:
@@ -44,23 +53,21 @@ def moved(T: Transform, by: Float[np.ndarray, "6"]) -> Transform:
 
 def refined(seen: Seen, rig: Rig, T_rig_board: Transform) -> Transform:
     """The place near a guess where the points of all cameras fit best."""
-    step = least_squares(lambda x: misplaced_px(seen, rig, moved(T_rig_board, x)).ravel(), np.zeros(6), method="lm",
-                         x_scale=np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])).x
-    return moved(T_rig_board, step)
+    def residuals(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "r"]:
+        return misplaced_px(seen, rig, moved(T_rig_board, x)).ravel()
+
+    def slopes(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "r 6"]:
+        # a turn vector's slopes are those of a small turn only where it begins: near enough for so small steps
+        now = moved(T_rig_board, x)
+        return _misplaced(seen, rig, now, now[:3, 3])[1]
+
+    return moved(T_rig_board, least_squares(residuals, np.zeros(6), slopes, method="lm", x_scale="jac").x)
 
 
-def information(seen: Seen, rig: Rig, T_rig_board: Transform, middle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 6"]:
+def information(seen: Seen, rig: Rig, T_rig_board: Transform, middle: Vector) -> Float[np.ndarray, "6 6"]:
     """How well the images tell the board's turn (about its middle) and way, in the rig's frame: the inverse covariance for
     points that err by 1 px along each axis."""
-    to_middle = geometry.make(np.eye(3), middle)
-    columns = []
-    for k in range(6):
-        step = np.zeros(6)
-        step[k] = 1e-5
-        both = [misplaced_px(seen, rig, moved(T_rig_board @ to_middle, sign * step) @ geometry.inverse(to_middle)).ravel()
-                for sign in (1, -1)]
-        columns.append((both[0] - both[1]) / 2e-5)
-    slopes = np.column_stack(columns)
+    slopes = _misplaced(seen, rig, T_rig_board, geometry.transform(T_rig_board, middle))[1]
     told: Float[np.ndarray, "6 6"] = slopes.T @ slopes
     return told
 
