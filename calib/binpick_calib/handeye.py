@@ -26,6 +26,9 @@ from binpick_calib import robot
 from binpick_calib import views as viewing
 from binpick_calib.robot import Row
 
+CLOSE_M = handeye.WORST_M / 2
+"""Another reading of the angles is told when half of the samples then agree so well."""
+
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -68,7 +71,7 @@ def run(request: Request, created: str) -> Outcome:
     try:
         found = handeye.solve(samples, rig, request.mounting, request.z_m)
     except InputError as error:
-        raise InputError(f"{error}{_other_reading(table, rows, seen, rig, request)}{_told(unused)}") from error
+        raise InputError(f"{error}{_other_reading(table, rows, samples, rig, request.mounting)}{_told(unused)}") from error
     return Outcome(mounted(rig, found, created), found, unused | found.outliers, warnings)
 
 
@@ -136,25 +139,18 @@ def _look(shot: viewing.Shot, rig: Rig, board: Board, unused: dict[str, str]) ->
     return (*seen, *[None] * (len(rig.cameras) - len(seen)))
 
 
-def _other_reading(table: robot.Table, rows: dict[int, Row], seen: dict[int, tuple[Detection | None, ...]], rig: Rig,
-                   request: Request) -> str:
+def _other_reading(table: robot.Table, rows: dict[int, Row], samples: Sequence[Sample], rig: Rig, mounting: Mounting) -> str:
     """Under which other reading of the angles robot and cameras would agree, as a sentence."""
-    if table.pose_format is PoseFormat.quaternion_xyzw:
+    seen = [sample for sample in samples if any(sample.seen)]
+    if table.pose_format is PoseFormat.quaternion_xyzw or len(seen) < handeye.FEWEST:
         return ""
-    readings = []
-    for pose_format in (PoseFormat.kuka_abc_deg, PoseFormat.fanuc_wpr_deg, PoseFormat.rotvec_rad):
-        for scale, how in ((1.0, ""), (180 / np.pi, " in radians"), (np.pi / 180, " in degrees")):
-            samples = [Sample(str(number), table.T_base_flange(rows[number], pose_format, scale), each)
-                       for number, each in seen.items()]
-            try:
-                found = handeye.solve(samples, rig, request.mounting, request.z_m)
-            except InputError:
-                continue
-            readings.append((found.rms_m, f"{pose_format.name}{how}"))
-    if not readings:
+    readings = {f"{pose_format.name}{how}": [table.T_base_flange(rows[int(sample.name)], pose_format, scale) for sample in seen]
+                for pose_format in (PoseFormat.kuka_abc_deg, PoseFormat.fanuc_wpr_deg, PoseFormat.rotvec_rad)
+                for scale, how in ((1.0, ""), (180 / np.pi, " in radians"), (np.pi / 180, " in degrees"))}
+    apart_m, name = min((apart_m, name) for name, apart_m in handeye.agreement(seen, rig, mounting, readings).items())
+    if apart_m > CLOSE_M:
         return ""
-    rms_m, name = min(readings)
-    return (f". Read as {name} the poses agree to {1000 * rms_m:.1f} mm: is that what they are (they were read as "
+    return (f". Read as {name} the poses agree to {1000 * apart_m:.1f} mm: is that what they are (they were read as "
             f"{table.pose_format.name})?")
 
 

@@ -85,7 +85,8 @@ def test_poses_as_yaml(tmp_path: Path) -> None:
     (["x_m,y_m,z_m,a,b,c", "0.1,0.2,0.3,4,5,six"], "poses.csv:2: 'six' is not a number"),
     (["x_m,y_m,z_m,a,b,c", "500,20,300,4,5,6"], "poses.csv:2: the flange would be 583 m from its base: is the unit right"),
     (["x_m,y_m,z_m,qx,qy,qz,qw", ".5,.2,.3,0,0,0,2"], "a quaternion of length 2.000"),
-    (["x_m,y_m,z_m,rx_deg,ry_deg,rz_deg", ".5,.2,.3,0,0,2"], "say which angles they are by --pose-format"), ([""], "nothing in it")])
+    (["x_m,y_m,z_m,rx_deg,ry_deg,rz_deg", ".5,.2,.3,0,0,2"], "say which angles they are by --pose-format"),
+    ([""], "nothing in it")])
 def test_what_is_wrong_with_a_table(tmp_path: Path, lines: list[str], said: str) -> None:
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
         robot.read(write(tmp_path / "poses.csv", *lines))
@@ -112,7 +113,8 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines = ["name,x_mm,y_mm,z_mm,a,b,c"]
     for number, tilt in enumerate(TILTS_DEG, start=1):
         R = Rotation.from_euler("xyz", tilt, degrees=True).as_matrix()
-        T = geometry.make(R, np.array([0.06 + 0.03 * (number % 3 - 1), 0.04 * (number % 2) - 0.02, 0.45 + 0.02 * number]) - R @ middle)
+        where = np.array([0.06 + 0.03 * (number % 3 - 1), 0.04 * (number % 2) - 0.02, 0.45 + 0.02 * number])
+        T = geometry.make(R, where - R @ middle)
         cv2.imwrite(str(folder / f"left{number:02d}.png"), draw(T))
         cv2.imwrite(str(folder / f"right{number:02d}.png"), draw(T_RIGHT_LEFT @ T))
         T_base_flange = T_BASE_BOARD @ geometry.inverse(T) @ geometry.inverse(T_FLANGE_RIG)
@@ -128,8 +130,9 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(cell: Path, out: Path, **change: object) -> list[object]:
-    options = {"poses": cell / "poses.csv", "left": cell / "left*.png", "right": cell / "right*.png", "rig": cell / "rig.json",
-               "board": f"chessboard:{COLUMNS}x{ROWS}:{SQUARE_M}", "mounting": "flange", "out": out} | change
+    options: dict[str, object] = {
+        "poses": cell / "poses.csv", "left": cell / "left*.png", "right": cell / "right*.png", "rig": cell / "rig.json",
+        "board": f"chessboard:{COLUMNS}x{ROWS}:{SQUARE_M}", "mounting": "flange", "out": out} | change
     return ["handeye", *(part for name, value in options.items() for part in (f"--{name}", value))]
 
 
@@ -157,7 +160,7 @@ def test_a_rig_file_that_knows_the_robot(cell: Path, tmp_path: Path, monkeypatch
     ({"mounting": "base"}, "With the rig mounted the other way, on flange or base, they agree to 0.0 mm"),
     ({"pose-format": "fanuc_wpr_deg"}, "Read as kuka_abc_deg the poses agree to 0.0 mm"),
     ({"pose-format": "euler"}, "--pose-format euler: it is one of quaternion_xyzw"),
-    ({"board": "chessboard:8x5:0.025"}, "seen in 0 samples, 5 are needed"),
+    ({"board": "apriltag:36h11:0.05"}, "seen in 0 samples, 5 are needed"),
     ({"poses": "few.csv"}, "few.csv: 2 poses without names do not belong to 8 images")])
 def test_nothing_is_written_when_it_does_not_fit(cell: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                                                  capsys: pytest.CaptureFixture[str], change: dict[str, str], said: str) -> None:
@@ -178,12 +181,14 @@ def touch(path: Path, corners: list[tuple[int, int]], floor_m: tuple[float, floa
           T_base_bin: Transform = T_BASE_BIN) -> Path:
     """Some inner corners by their signs, 0.5 mm off, and the floor."""
     rng, lines = np.random.default_rng(0), ["name,x_mm,y_mm,z_mm"]
-    for kind, point in [("rim", (x * INNER_M[0] / 2, y * INNER_M[1] / 2, INNER_M[2])) for x, y in corners] + [("floor", floor_m)]:
+    rim = [("rim", (x * INNER_M[0] / 2, y * INNER_M[1] / 2, INNER_M[2])) for x, y in corners]
+    for kind, point in [*rim, ("floor", floor_m)]:
         lines.append(f"{kind},{told(1000 * geometry.transform(T_base_bin, np.array(point)) + rng.normal(0, 0.3, 3))}")
     return write(path, *lines)
 
 
-@pytest.mark.parametrize("corners", [[(-1, -1), (1, -1), (1, 1)], [(1, 1), (-1, 1), (-1, -1)], [(1, -1), (-1, -1), (-1, 1), (1, 1)]])
+@pytest.mark.parametrize("corners", [[(-1, -1), (1, -1), (1, 1)], [(1, 1), (-1, 1), (-1, -1)],
+                                     [(1, -1), (-1, -1), (-1, 1), (1, 1)]])
 def test_a_bin_touched_with_the_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
                                       corners: list[tuple[int, int]]) -> None:
     points = touch(tmp_path / "touched.csv", corners)
@@ -199,7 +204,7 @@ def test_a_bin_touched_with_the_robot(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(("lines", "said"), [
     (["rim,0,0,200", "rim,300,0,200", "rim,600,1,200", "floor,100,100,20"], "lie on one line"),
     (["rim,0,0,20", "rim,600,0,20", "rim,600,400,20", "floor,100,100,200"], "the floor lies 180 mm above the rim"),
-    (["rim,0,0,200", "rim,600,0,200", "rim,600,400,200", "floor,100,100,50"], "150.0 mm below the rim, the bin's inner height is"),
+    (["rim,0,0,200", "rim,600,0,200", "rim,600,400,200", "floor,100,100,50"], "150.0 mm below the rim, the bin's inner height"),
     (["rim,0,0,200", "rim,500,0,200", "rim,500,400,200", "floor,100,100,20"], "they are 400, 500, 640 mm apart"),
     (["rim,0,0,200", "rim,600,0,200", "floor,100,100,20"], "2 points of the rim and 1 of the floor"),
     (["wall,0,0,200"], "touched.csv:2: 'wall': name each point rim"),
@@ -220,8 +225,8 @@ def test_a_bin_seen(photograph: Callable[..., CycleInput], expecting: Callable[.
         cv2.imwrite(str(tmp_path / f"{name}.png"), getattr(inputs.pair, name).image)
     (tmp_path / "rig.json").write_bytes(rig.dump(inputs.rig))
     (tmp_path / "cell.yaml").write_text(bins.text(model))
-    seen = ["bin", "--locate", "--left", tmp_path / "left.png", "--right", tmp_path / "right.png", "--rig", tmp_path / "rig.json",
-            "--cell", tmp_path / "cell.yaml"]
+    seen = ["bin", "--locate", "--left", tmp_path / "left.png", "--right", tmp_path / "right.png",
+            "--rig", tmp_path / "rig.json", "--cell", tmp_path / "cell.yaml"]
     assert run(monkeypatch, *seen, "--out", tmp_path / "bin.yaml") == 0
     found = yaml.safe_load((tmp_path / "bin.yaml").read_text())["bin"]["pose"]
     assert found["frame"] == "camera"

@@ -207,7 +207,8 @@ def test_one_wrong_pose_among_twelve_is_named(mounting: str, change: Transform) 
     assert "the pose is wrong, or the robot or the board moved" in found.outliers["9"]
     without = handeye.solve([*samples[:8], *samples[9:]], RIG, mounting)
     for T, known in ((found.T_base_rig, without.T_base_rig), (found.T_flange_rig, without.T_flange_rig)):
-        assert T is known is None or T == pytest.approx(known, abs=1e-7)
+        assert (T is None) == (known is None)
+        assert T is None or pytest.approx(known, abs=1e-7) == T
 
 
 def test_a_pose_that_belongs_to_another_sample_is_said_so() -> None:

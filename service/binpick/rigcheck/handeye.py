@@ -171,6 +171,21 @@ def _views(seen: Sequence[Sample], case: _Case) -> tuple[list[View], Float[np.nd
     return views, guess.apart_m
 
 
+def agreement(seen: Sequence[Sample], rig: Rig, mounting: Mounting,
+              readings: dict[str, list[Transform]]) -> dict[str, float]:
+    """How well half of the samples would agree, m, if their T_base_flange were these: tells a misread table."""
+    case = _Case(rig, _board(seen), mounting, None)
+    turns = places.turned(case.board)
+    boards = [[place @ geometry.inverse(turn) for place in places.places(sample.seen, rig) for turn in turns]
+              for sample in seen]
+    apart_m = {}
+    for name, poses in readings.items():
+        mounts = poses if mounting == "flange" else [geometry.inverse(T) for T in poses]
+        guess = None if spread.fault(poses, False) else loop.guess(mounts, boards, case.solver, corners(case.board))
+        apart_m[name] = float("inf") if guess is None else guess.score_m
+    return apart_m
+
+
 def _agreed(views: Sequence[View], apart_m: Float[np.ndarray, "n"], case: _Case) -> tuple[list[int], Adjusted]:
     """The samples that agree, and what they agree on: fitted to them, judged by it, until both stand."""
     used = _near(apart_m)
