@@ -163,5 +163,5 @@ def placed(model: Bin, T_parent_bin: Transform) -> Bin:
 
 def text(model: Bin) -> str:
     """The `bin:` of a cell file."""
-    document = model.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+    document = model.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump({"bin": document}, sort_keys=False, default_flow_style=None)

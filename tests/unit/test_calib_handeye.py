@@ -237,6 +237,6 @@ def test_a_bin_seen(photograph: Callable[..., CycleInput], expecting: Callable[.
     (tmp_path / "cell.yaml").write_text(bins.text(larger))
     capsys.readouterr()
     assert run(monkeypatch, *seen) == 1
-    assert "106 BIN_MISMATCH" in capsys.readouterr().err
+    assert "106 bin_mismatch" in capsys.readouterr().err
     assert run(monkeypatch, *seen[:-2]) == 2
     assert "--locate needs" in capsys.readouterr().err

@@ -158,14 +158,14 @@ def _views(seen: Sequence[Sample], case: _Case) -> tuple[list[View], Float[np.nd
     turns = places.turned(case.board)
     ways = [[(place, turn) for place in places.places(sample.seen, case.rig) for turn in turns] for sample in seen]
     points = corners(case.board)
-    guess = loop.guess(mounts, [[place @ geometry.inverse(turn) for place, turn in some] for some in ways], case.solver, points)
+    guess = loop.guess(mounts, [[place @ geometry.inverse(turn) for place, turn in some] for some in ways], len(turns),
+                       case.solver, points)
     if guess is None:
         raise InputError("no transform fits the samples: check the robot's poses")
     views = []
     for sample, mount, some, k in zip(seen, mounts, ways, guess.chosen, strict=True):
         place, turn = some[k]
-        T_mount_flange = np.eye(4) if case.mounting == "flange" else sample.T_base_flange
-        views.append(View(sample.name, mount, T_mount_flange, place @ geometry.inverse(turn),
+        views.append(View(sample.name, mount, place @ geometry.inverse(turn),
                           places.information(sample.seen, case.rig, place, geometry.transform(turn, points.mean(0))),
                           places.rms_px(sample.seen, case.rig, place)))
     return views, guess.apart_m
@@ -181,7 +181,7 @@ def agreement(seen: Sequence[Sample], rig: Rig, mounting: Mounting,
     apart_m = {}
     for name, poses in readings.items():
         mounts = poses if mounting == "flange" else [geometry.inverse(T) for T in poses]
-        guess = None if spread.fault(poses, False) else loop.guess(mounts, boards, case.solver, corners(case.board))
+        guess = None if spread.fault(poses, False) else loop.guess(mounts, boards, len(turns), case.solver, corners(case.board))
         apart_m[name] = float("inf") if guess is None else guess.score_m
     return apart_m
 
@@ -228,7 +228,7 @@ def _disagreement(views: Sequence[View], used: Sequence[int], rms_m: float, case
     told = (f"only {len(used)} of {len(views)} samples agree (not {names})" if names else "robot and cameras disagree") + \
         f", to {1000 * rms_m:.1f} mm; {max(FEWEST, round(AGREEING * len(views)))} must agree to {1000 * WORST_M:.0f} mm. "
     other = loop.guess([geometry.inverse(view.T_carrier_mount) for view in views], [[view.T_rig_board] for view in views],
-                       case.solver, corners(case.board))
+                       1, case.solver, corners(case.board))
     if other is not None and other.score_m < min(WORST_M, rms_m / 3):
         return told + (f"With the rig mounted the other way, on flange or base, they agree to {1000 * other.score_m:.1f} mm: "
                        "check the mounting, and that the poses are those of the flange in the base")

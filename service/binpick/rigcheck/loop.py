@@ -25,7 +25,7 @@ off, prints a line for each set of samples that it cannot solve."""
 TRIPLES = 60
 """So many threes of samples are tried; of 30 samples a third may be wrong before none of the threes is right."""
 COMBINATIONS = 16
-"""So many ways to combine the places in which a three's boards may be seen."""
+"""So many ways to combine the places in which a three's boards may be seen: all of a board with four ends, tilted one way."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,15 +116,17 @@ def best(mounts: Transforms, boards: Transforms, solver: Solver) -> Transform | 
     return min(solver(mounts, boards), key=apart_m, default=None)
 
 
-def guess(mounts: Transforms, places: Sequence[Transforms], solver: Solver, corners: Float[np.ndarray, "k 3"]) -> Guess | None:
+def guess(mounts: Transforms, places: Sequence[Transforms], turns: int, solver: Solver,
+          corners: Float[np.ndarray, "k 3"]) -> Guess | None:
     """The least median of distances over many small sets of samples: it stands while most samples are right.
 
-    `places` are the T_rig_board in which each sample's board may be seen; `corners` of the board are what is compared.
+    `places` are the T_rig_board in which each sample's board may be seen, each in as many `turns` as the board has that look
+    the same, one after the other; `corners` of the board are what is compared.
     """
     found = None
     owner = np.repeat(np.arange(len(mounts)), [len(some) for some in places])
     all_mounts, all_boards = np.array(mounts)[owner], np.array([T for some in places for T in some])
-    for some, chosen in _sets(mounts, places):
+    for some, chosen in _sets(mounts, [len(some) for some in places], turns):
         solved = solver([mounts[i] for i in some], [places[i][k] for i, k in zip(some, chosen, strict=True)])
         # the methods differ by noise, which a three has too much of anyway
         for T_mount_rig in islice(solved, 1 if len(some) == 3 else None):
@@ -134,7 +136,7 @@ def guess(mounts: Transforms, places: Sequence[Transforms], solver: Solver, corn
     return found
 
 
-def _sets(mounts: Transforms, places: Sequence[Transforms]) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
+def _sets(mounts: Transforms, places: Sequence[int], turns: int) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
     """All samples, all but one, and threes that turn about two axes, each with the places taken for their boards."""
     everyone = range(len(mounts))
     for left_out in (None, *everyone):
@@ -144,7 +146,9 @@ def _sets(mounts: Transforms, places: Sequence[Transforms]) -> Iterator[tuple[tu
     threes = sorted(combinations(everyone, 3), key=lambda t: -np.linalg.norm(np.cross(turned[t[0], t[1]], turned[t[0], t[2]])))
     threes = threes[:max(TRIPLES, len(threes) // 2)]
     for three in threes[::max(1, len(threes) // TRIPLES)]:
-        for chosen in islice(product(*(range(len(places[i])) for i in three)), COMBINATIONS):
+        # which end the first is numbered from is all the same; the better place of each is tried first
+        ways = product(range(0, places[three[0]], turns), *(range(places[i]) for i in three[1:]))
+        for chosen in sorted(ways, key=lambda way: sum(k // turns for k in way))[:COMBINATIONS]:
             yield three, chosen
 
 
