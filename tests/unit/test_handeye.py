@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from binpick import geometry
@@ -131,6 +132,25 @@ def test_a_tag_on_a_real_hand() -> None:
     assert found.T_flange_rig is None
     with pytest.raises(InputError, match=r"With the rig mounted the other way.* they agree to 1\.\d mm"):
         handeye.solve(samples, rig, "flange")
+
+
+@pytest.mark.skipif(not (DATA / "handeye_rct_10x10").is_dir(), reason="the hand-eye set of RCT does not lie in ../shared/data")
+def test_rough_data_with_dots_that_have_four_ends() -> None:
+    K = [[542.324, 0, 320.474], [0, 543.515, 226.039], [0, 0, 1]]
+    cameras = [{"name": side, "K": K, "distortion": (0.0,) * 5, "T_cam_rig": geometry.translation(x, 0.0, 0.0).tolist()}
+               for side, x in (("left", 0.0), ("right", -0.15))]
+    samples = []
+    for number in range(15):
+        seen = sight.find(cv2.imread(str(DATA / f"handeye_rct_10x10/images/{number}.png"), cv2.IMREAD_GRAYSCALE),
+                          parse("circles:10x10:0.0254"))
+        pose = yaml.safe_load((DATA / f"handeye_rct_10x10/poses/{number}.yaml").read_text())
+        T = geometry.from_quaternion(np.array([pose[k] for k in ("x", "y", "z")]),
+                                     np.array([pose[k] for k in ("qx", "qy", "qz", "qw")]))
+        assert isinstance(seen, Detection)
+        samples.append(Sample(str(number), T, (seen, None)))
+    found = handeye.solve(samples, Rig.model_validate({"image_size_px": (640, 480), "cameras": cameras}), "flange")
+    assert found.rms_m < 0.008    # other tools: 13.6 mm
+    assert found.outliers == {}
 
 
 @pytest.mark.parametrize("mounting", ["base", "flange"])

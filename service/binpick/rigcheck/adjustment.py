@@ -17,6 +17,8 @@ ROUNDS = 6
 """Of weights and fit in turn; the weights stand after three or four."""
 LEAST_RAD, LEAST_M, LEAST_PX = np.radians(0.005), 0.00003, 0.02
 """Nothing errs by less."""
+MOST_BY_LEVER = 0.9
+"""Of the square of what is left over of the ways, the share that may be laid to turns of the flange."""
 
 Turns = Float[np.ndarray, "n 3 3"]
 Ways = Float[np.ndarray, "n 3"]
@@ -37,11 +39,13 @@ class Loop(NamedTuple):
 class View(NamedTuple):
     """One sample: where the mount stands by the robot, where the board by the images, and how well these tell it.
 
-    `information` is that of `places`, `rms_px` what is left over of the points at the board's best place.
+    `T_mount_flange` is the identity where the rig rides on the flange, else the robot's pose. `information` is that of
+    `places`, `rms_px` what is left over of the points at the board's best place.
     """
 
     name: str
     T_carrier_mount: Transform
+    T_mount_flange: Transform
     T_rig_board: Transform
     information: Float[np.ndarray, "6 6"]
     rms_px: float
@@ -95,17 +99,28 @@ def adjusted(views: Sequence[View], start: Loop, board: Board, upright: bool) ->
 
 
 def _left_over(views: Sequence[View], found: Loop, blur: Float[np.ndarray, "n 6 6"], middle: Vector,
-               unknowns: int) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the boards' turns and ways that the images do not account for: the robot's, the lens's, the board's own.
+               unknowns: int) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of the boards' turns and ways that the images do not account for: the robot's, the lens's, the board's own.
 
-    The two are taken apart. Laid to turns of the flange, which move a board at arm's length with it (tried), a robot and a lens
-    of 2 degrees (RCT's set) were fitted 90 mm off, for ways that went along with large turns then cost nothing.
+    A flange that errs in its turn moves a board at arm's length with it. Only as much of the turns is laid to that as the ways
+    bear out: without the limit (tried) a robot and a lens of 2 degrees (RCT's set) were fitted 90 mm off, for then large turns
+    made ways cost nothing; without the lever the exam's rig on a flange came out half again as far off.
     """
     off = apart(views, found, middle)
     fair = off.size / max(1, off.size - unknowns)
-    rad2, m2 = (max(least**2, fair * (off[:, part]**2).sum(1).mean() / 3 - np.trace(blur[:, part, part], axis1=1, axis2=2).mean() / 3)
-                for part, least in ((slice(3), LEAST_RAD), (slice(3, 6), LEAST_M)))
-    return np.diag([rad2] * 3 + [m2] * 3)
+    turn2, way2 = (max(3 * least**2, fair * (off[:, part]**2).sum(1).mean()
+                       - np.trace(blur[:, part, part], axis1=1, axis2=2).mean())
+                   for part, least in ((slice(3), LEAST_RAD), (slice(3, 6), LEAST_M)))
+    T_rig_mount = geometry.inverse(found.T_mount_rig)
+    lever = np.array([geometry.transform(view.T_rig_board, middle) - (T_rig_mount @ view.T_mount_flange)[:3, 3]
+                      for view in views])
+    by_turn = np.zeros((len(views), 6, 3))
+    by_turn[:, :3] = np.eye(3)
+    by_turn[:, 3:] = np.cross(np.eye(3)[None], lever[:, None]).transpose(0, 2, 1)
+    lever2 = 2 * float((lever**2).sum(1).mean())
+    robot = min(turn2 / 3, MOST_BY_LEVER * way2 / lever2)
+    covariance: Float[np.ndarray, "n 6 6"] = robot * by_turn @ by_turn.transpose(0, 2, 1)
+    return covariance + np.diag([turn2 / 3 - robot] * 3 + [(way2 - robot * lever2) / 3] * 3)
 
 
 def _step(views: Sequence[View], start: Loop, weights: Float[np.ndarray, "n 6 6"], middle: Vector,

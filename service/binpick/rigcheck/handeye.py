@@ -165,7 +165,8 @@ def _views(seen: Sequence[Sample], case: _Case) -> tuple[list[View], Float[np.nd
     views = []
     for sample, mount, some, k in zip(seen, mounts, ways, guess.chosen, strict=True):
         place, turn = some[k]
-        views.append(View(sample.name, mount, place @ geometry.inverse(turn),
+        T_mount_flange = np.eye(4) if case.mounting == "flange" else sample.T_base_flange
+        views.append(View(sample.name, mount, T_mount_flange, place @ geometry.inverse(turn),
                           places.information(sample.seen, case.rig, place, geometry.transform(turn, points.mean(0))),
                           places.rms_px(sample.seen, case.rig, place)))
     return views, guess.apart_m
