@@ -4,7 +4,7 @@ import json
 import re
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -14,6 +14,7 @@ from rich.table import Table
 
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
+from binpick.poses import PoseFormat
 from binpick_calib import board as boards
 from binpick_calib import loose, vector
 from binpick_calib import sheet as sheets
@@ -87,6 +88,71 @@ def import_loose(
     typer.echo(f"Written: {out}")
 
 
+@app.command("handeye")
+def hand_eye(
+    poses: Annotated[Path, typer.Option(metavar="FILE", help="Robot poses, .csv or .yaml: name,x_mm,y_mm,z_mm and a,b,c "
+                                                             "(KUKA), w,p,r (FANUC), rx,ry,rz (UR), qx..qw, q1..q4 (ABB).")],
+    left: Annotated[str, typer.Option(metavar="GLOB", help="Images of the left camera, quoted: 'shots/left*.png'.")],
+    rig: Annotated[Path, typer.Option(metavar="FILE", help="The rig file of `solve`.")],
+    board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as for solve, or a tag: apriltag:36h11:0.08.")],
+    mounting: Annotated[Literal["base", "flange"], typer.Option(help="What carries the cameras; the other carries the board.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
+    right: Annotated[str, typer.Option(metavar="GLOB", help="Images of the right camera.")] = "",
+    pose_format: Annotated[str, typer.Option(metavar="NAME", help=f"The angles, if the table's head does not tell: "
+                                                                  f"{', '.join(known.name for known in PoseFormat)}.")] = "",
+    unit: Annotated[Literal["", "mm", "m"], typer.Option(help="Of positions, where the head does not tell.")] = "",
+    z: Annotated[float | None, typer.Option(metavar="M", help="For robots with four axes: height of the board's first point in "
+                                            "the flange (cameras on the base), else in the base.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Find where the cameras stand in the robot's base, or ride on its flange.
+
+    Poses and images belong together by the number in their names; 10 or more, the flange tilted by
+    20 to 40 degrees every way. A sample that contradicts the others is left out and named; when
+    robot and cameras do not agree, nothing is written.
+    """
+    from binpick_calib import handeye
+
+    outcome = handeye.run(handeye.Request(poses, left, right, rig, board, mounting, pose_format, unit, z), _now())
+    _write(out, rigs.dump(outcome.rig))
+    for warning in outcome.warnings:
+        typer.echo(warning, err=True)
+    if as_json:
+        typer.echo(json.dumps(handeye.figures(outcome) | {"out": str(out)}))
+    else:
+        handeye.show(Console(), outcome)
+        typer.echo(f"Written: {out}")
+
+
+@app.command("bin")
+def carrier(
+    points: Annotated[Path | None, typer.Option(metavar="FILE", help="Points touched, in the robot's base, .csv: name,x_mm,"
+                                                "y_mm,z_mm; three or four named rim (inner corners), one floor.")] = None,
+    size: Annotated[str, typer.Option(metavar="LxWxH", help="Inner size, metres: 0.6x0.4x0.18; or give --cell.")] = "",
+    unit: Annotated[Literal["", "mm", "m"], typer.Option(help="Of the points, where the head does not tell.")] = "",
+    locate: Annotated[bool, typer.Option("--locate", help="Instead of points: see the rim in a pair of images.")] = False,
+    left: Annotated[Path | None, typer.Option(metavar="FILE", help="The left image.")] = None,
+    right: Annotated[Path | None, typer.Option(metavar="FILE", help="The right image.")] = None,
+    rig: Annotated[Path | None, typer.Option(metavar="FILE", help="The rig file.")] = None,
+    cell: Annotated[Path | None, typer.Option(metavar="FILE", help="The cell file: the bin's size and rough place.")] = None,
+    number: Annotated[int, typer.Option("--bin", min=1, max=65535, help="Which bin of the cell file.")] = 1,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it there; else it is printed.")] = None,
+) -> None:
+    """Find where a bin stands, as the `bin:` of a cell file.
+
+    Touched with the robot: the tool's tip in three inner corners of the rim and on the floor. Or
+    with --locate by its rim in a pair of images, near where the cell file has it.
+    """
+    from binpick_calib import bin as bins
+
+    found = bins.run(points, size, unit, (left, right, rig) if locate else None, cell, number)
+    if out is None:
+        typer.echo(found, nl=False)
+    else:
+        _write(out, found.encode())
+        typer.echo(f"Written: {out}")
+
+
 @app.command("board")
 def print_board(
     board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as solve is told it: chessboard:9x6:0.025, "
@@ -101,6 +167,10 @@ def print_board(
     sheet = sheets.layout(boards.parse(board), page)
     _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
     typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _write(out: Path, content: bytes) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from binpick.errors import InputError
 from binpick.rigcheck.board import Board, Kind
@@ -102,13 +103,26 @@ def _charuco(board: Board) -> tuple[list[Box | Disc], float, float]:
                                 for column in range(board.columns + 1) if (column, row) not in marked]
     cell = 1000 * board.mark_m / cells
     for number, place in zip(drawn.getIds().ravel().tolist(), corners, strict=True):
-        black = cv2.aruco.generateImageMarker(dictionary, number, cells) < 128
-        for row, bits in enumerate(black):
-            # a run of black cells at a time
-            starts, ends = (np.flatnonzero(np.diff(np.r_[0, bits, 0].astype(int)) == sign) for sign in (1, -1))
-            shapes += [Box(place[0] + start * cell, place[1] + row * cell, (end - start) * cell, cell)
-                       for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
+        shapes += _marker(cv2.aruco.generateImageMarker(dictionary, number, cells) < 128, place, cell)
     return shapes, (board.columns + 1) * side, (board.rows + 1) * side
+
+
+def _marker(black: Bool[np.ndarray, "n n"], place: Float[np.ndarray, "2"], cell: float) -> list[Box | Disc]:
+    """A marker's black cells, a run of a row at a time."""
+    shapes: list[Box | Disc] = []
+    for row, bits in enumerate(black):
+        starts, ends = (np.flatnonzero(np.diff(np.r_[0, bits, 0].astype(int)) == sign) for sign in (1, -1))
+        shapes += [Box(place[0] + start * cell, place[1] + row * cell, (end - start) * cell, cell)
+                   for start, end in zip(starts.tolist(), ends.tolist(), strict=True)]
+    return shapes
+
+
+def _tag(board: Board) -> tuple[list[Box | Disc], float, float]:
+    """Number 0 of its family, with a cell of white around it."""
+    family = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}".upper()))
+    cells, side = family.markerSize + 2, 1000 * board.square_m
+    black = cv2.aruco.generateImageMarker(family, 0, cells) < 128
+    return _marker(black, np.array([1.0, 1.0]) * side / cells, side / cells), side * (1 + 2 / cells), side * (1 + 2 / cells)
 
 
 def _dots(board: Board) -> tuple[list[Box | Disc], float, float]:
@@ -119,7 +133,7 @@ def _dots(board: Board) -> tuple[list[Box | Disc], float, float]:
     return [Disc(x + edge, y + edge, 500 * board.mark_m) for x, y in places.tolist()], width, height
 
 
-_SHAPES = {Kind.CHESSBOARD: _chessboard, Kind.CHARUCO: _charuco, Kind.CIRCLES: _dots, Kind.ASYMMETRIC: _dots}
+_SHAPES = {Kind.CHESSBOARD: _chessboard, Kind.CHARUCO: _charuco, Kind.CIRCLES: _dots, Kind.ASYMMETRIC: _dots, Kind.TAG: _tag}
 
 
 def _foot(board: Board, width: float, height: float) -> tuple[tuple[Box | Disc, ...], tuple[Line, ...]]:

@@ -61,7 +61,8 @@ def match(*patterns: str) -> tuple[list[Shot], dict[str, str]]:
     place = _counting_place([[numbers[path] for path in files if numbers[path]] for files in found.values()])
     numbered = [{numbers[path][place]: path for path in files if numbers[path]} for files in found.values()]
     shots = [Shot(number, (path, *(other.get(number) for other in numbered[1:])))
-             for number, path in sorted(numbered[0].items()) if any(number in other for other in numbered[1:])]
+             for number, path in sorted(numbered[0].items())
+             if len(numbered) == 1 or any(number in other for other in numbered[1:])]
     if not shots:
         raise InputError("no left and right image carry the same number in their names "
                          f"(such as {found['left'][0].name} and {found['right'][0].name})")
@@ -75,7 +76,7 @@ def match(*patterns: str) -> tuple[list[Shot], dict[str, str]]:
 
 def sides(count: int) -> tuple[str, ...]:
     """What the cameras are called: left, right, camera3, ..."""
-    return ("left", "right", *(f"camera{n}" for n in range(3, count + 1)))
+    return ("left", "right", *(f"camera{n}" for n in range(3, count + 1)))[:count]
 
 
 def _files(pattern: str, side: str) -> list[Path]:

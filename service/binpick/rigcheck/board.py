@@ -13,9 +13,10 @@ from binpick.errors import InputError
 
 EXAMPLES = ("chessboard:9x6:0.025 (inner corners, side of a square in metres), charuco:9x6:0.025[:0.018[:5x5_1000]] (inner "
             "corners, side of a square, side of a marker, dictionary), circles:9x7:0.02[:0.012] (dots each way, distance of "
-            "neighbours, diameter) or acircles:4x11:0.02[:0.012] (dots of a row and rows, half the distance of dots of a row, "
-            "diameter)")
+            "neighbours, diameter), acircles:4x11:0.02[:0.012] (dots of a row and rows, half the distance of dots of a row, "
+            "diameter) or apriltag:36h11:0.08 (a single tag: family, side of its black square)")
 _SPEC = re.compile(r"(chessboard|charuco|circles|acircles):(\d+)x(\d+):(\d*\.?\d+)(?::(\d*\.?\d+)(?::(\w+))?)?")
+_TAG = re.compile(r"apriltag:(\w+):(\d*\.?\d+)")
 
 
 class Kind(StrEnum):
@@ -25,6 +26,7 @@ class Kind(StrEnum):
     CHARUCO = "charuco"
     CIRCLES = "circles"
     ASYMMETRIC = "acircles"
+    TAG = "apriltag"
 
 
 _USUAL_MARKER = 0.75
@@ -32,7 +34,7 @@ _USUAL_MARKER = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """`columns` x `rows` points: inner corners of a chessboard or ChArUco, or centres of dots.
+    """`columns` x `rows` points: inner corners of a chessboard or ChArUco, centres of dots, or the corners of one tag.
 
     `square_m`: a square's side; of circles the distance of neighbours; of asymmetric circles half the distance of neighbours
     in a row, which is the distance of rows (as in OpenCV). `mark_m`: side of a marker, diameter of a dot; 0: unknown or none.
@@ -46,6 +48,8 @@ class Board:
     dictionary: str = ""
 
     def __str__(self) -> str:
+        if self.kind is Kind.TAG:
+            return f"{self.kind}:{self.dictionary.removeprefix('apriltag_')}:{self.square_m:g}"
         marked = f":{self.mark_m:g}" if self.mark_m else ""
         return f"{self.kind}:{self.columns}x{self.rows}:{self.square_m:g}{marked}" + (f":{self.dictionary}" if self.dictionary
                                                                                      else "")
@@ -63,10 +67,10 @@ class Board:
     def turns(self) -> tuple[Int32[np.ndarray, "n"], ...]:
         """The other numberings under which the board looks the same: ids of the points that stand in each point's place.
 
-        Empty for a board that shows which way it lies: a ChArUco, a chessboard with one odd and one even count, asymmetric
-        circles. The others have a half turn, a square grid of dots the quarter turns, too.
+        Empty for a board that shows which way it lies: a ChArUco, a tag, a chessboard with one odd and one even count,
+        asymmetric circles. The others have a half turn, a square grid of dots the quarter turns, too.
         """
-        if self.kind is Kind.CHARUCO or (self.kind is Kind.CHESSBOARD and (self.columns + self.rows) % 2):
+        if self.kind in (Kind.CHARUCO, Kind.TAG) or (self.kind is Kind.CHESSBOARD and (self.columns + self.rows) % 2):
             return ()
         quarters = [1, 2, 3] if self.kind is Kind.CIRCLES else [2]
         turned = (self._places(np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarter)) for quarter in quarters)
@@ -96,13 +100,17 @@ class Board:
 
 def parse(spec: str) -> Board:
     """The board of `chessboard:9x6:0.025` and its like. Raises InputError, which says how each kind is written."""
+    tag = _TAG.fullmatch(spec.strip().lower())
     found = _SPEC.fullmatch(spec.strip().lower())
+    if tag:
+        square_m = float(tag[2])
+        _check_side(spec, square_m)
+        return Board(2, 2, square_m, Kind.TAG, dictionary=_dictionary(spec, f"apriltag_{tag[1].removeprefix('tag')}", 1))
     if not found:
         raise InputError(f"--board {spec}: write it as {EXAMPLES}")
     kind, columns, rows, square_m = Kind(found[1]), int(found[2]), int(found[3]), float(found[4])
     _check_counts(spec, kind, columns, rows)
-    if not 0.001 <= square_m <= 0.5:
-        raise InputError(f"--board {spec}: a square of {square_m:g} m; give its side in metres, 0.001 to 0.5")
+    _check_side(spec, square_m)
     if kind is Kind.CHESSBOARD:
         if found[5]:
             raise InputError(f"--board {spec}: a chessboard has no markers; write it as chessboard:9x6:0.025")
@@ -117,6 +125,11 @@ def parse(spec: str) -> Board:
         return Board(columns, rows, square_m, kind, mark_m)
     dictionary = _dictionary(spec, found[6] or "5x5_1000", (columns + 1) * (rows + 1) // 2)
     return Board(columns, rows, square_m, kind, mark_m, dictionary)
+
+
+def _check_side(spec: str, square_m: float) -> None:
+    if not 0.001 <= square_m <= 0.5:
+        raise InputError(f"--board {spec}: a square of {square_m:g} m; give its side in metres, 0.001 to 0.5")
 
 
 def _check_counts(spec: str, kind: Kind, columns: int, rows: int) -> None:

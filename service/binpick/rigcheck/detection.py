@@ -97,8 +97,8 @@ def edges(image: Image, board: Board, ids: Int32[np.ndarray, "n"],
     """Sigma of the board's edges, px, and its contrast, grey levels: medians over profiles between neighbouring points.
 
     Of rows and columns the softer counts: a hand moves a board one way, and across that way the edges stay sharp. Between two
-    corners of a chessboard the edge is crossed at half way, square to it; between two dots the profile leaves the one and
-    enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
+    corners of a chessboard or tag the edge is crossed at half way, square to it; between two dots the profile leaves the one
+    and enters the other. The steepest slope of a step of height c blurred by sigma is c / (sigma * sqrt(2 pi)).
     """
     pairs = neighbours(board, ids)
     in_row = ids[pairs[:, 1]] - ids[pairs[:, 0]] == 1
@@ -111,7 +111,7 @@ def _profiles(image: Image, board: Board, corners_px: Float32[np.ndarray, "n 2"]
               pairs: Int32[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, "k 65"], Float[np.ndarray, "k"]]:
     """Grey levels along lines across the edges between neighbours, and the distance of two samples, px."""
     start, along = corners_px[pairs[:, 0]], corners_px[pairs[:, 1]] - corners_px[pairs[:, 0]]
-    if board.kind in (Kind.CHESSBOARD, Kind.CHARUCO):
+    if board.kind in (Kind.CHESSBOARD, Kind.CHARUCO, Kind.TAG):
         start, along = start + along / 2, np.stack([-along[:, 1], along[:, 0]], axis=1)
         start = start - along / 2
     at = start[:, None] + np.linspace(0, 1, 65, dtype=np.float32)[:, None] * along[:, None]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from binpick.data import Image
-from binpick.rigcheck import charuco, chessboard, circles
+from binpick.rigcheck import apriltag, charuco, chessboard, circles
 from binpick.rigcheck.board import Board, Kind
 from binpick.rigcheck.detection import Detection, Refusal, judge, neighbours
 
@@ -22,7 +22,7 @@ def find(image: Image, board: Board) -> Detection | Refusal:
     if board.kind is Kind.CHARUCO:
         seen = charuco.find(image, board)
     else:
-        finder = chessboard if board.kind is Kind.CHESSBOARD else circles
+        finder = {Kind.CHESSBOARD: chessboard, Kind.TAG: apriltag}.get(board.kind, circles)
         corners = finder.find(image, board)
         seen = None if corners is None else (np.arange(len(corners), dtype=np.int32), corners)
     if seen is None:
@@ -39,6 +39,8 @@ def find(image: Image, board: Board) -> Detection | Refusal:
 def _why_not(image: Image, board: Board) -> str:
     points = {Kind.CHESSBOARD: "inner corners", Kind.CHARUCO: "inner corners and its markers"}.get(board.kind, "dots")
     what = f"no board with {board.columns}x{board.rows} {points} seen"
+    if board.kind is Kind.TAG:
+        what = f"not one tag of {board.dictionary} seen, or several"
     dark, light = np.quantile(cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), [0.02, 0.98])
     if light - dark < _FAINT:
         return f"{what}: the image is all one grey ({dark:.0f} to {light:.0f} of 255)"
@@ -79,8 +81,9 @@ def pair(left: Detection, right: Detection) -> tuple[Detection, Detection] | Ref
     if isinstance(aligned, Refusal):
         return aligned
     common = np.intersect1d(left.ids, aligned.ids)
-    if len(common) < charuco.FEWEST:
-        return Refusal(f"both cameras see only {len(common)} of the same points, {charuco.FEWEST} are needed")
+    fewest = min(charuco.FEWEST, len(left.board.points_m))
+    if len(common) < fewest:
+        return Refusal(f"both cameras see only {len(common)} of the same points, {fewest} are needed")
     return _cut(left, common), _cut(aligned, common)
 
 
