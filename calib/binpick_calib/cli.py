@@ -14,11 +14,10 @@ from rich.table import Table
 
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
-from binpick_calib import board as boards
+from binpick.rigcheck.board import Board, parse
 from binpick_calib import loose, vector
 from binpick_calib import sheet as sheets
 from binpick_calib import views as viewing
-from binpick_calib.board import Board
 from binpick_calib.solve import Solution
 from binpick_calib.solve import solve as solve_views
 
@@ -47,7 +46,7 @@ def solve(
     disagree with the others are left out and named, with the reason; if most disagree, or the rig
     that comes out cannot be, nothing is written.
     """
-    spec = boards.parse(board)
+    spec = parse(board)
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     shots, alone = viewing.match(left, right, *(camera or ()))
@@ -98,7 +97,7 @@ def print_board(
     """Write a board to print at true scale, with a ruler of 100 mm to check the print by."""
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise InputError(f"--out {out}: write a .pdf or an .svg file")
-    sheet = sheets.layout(boards.parse(board), page)
+    sheet = sheets.layout(parse(board), page)
     _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
     typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
 

@@ -9,9 +9,9 @@ import numpy as np
 from binpick import geometry
 from binpick.errors import InputError
 from binpick.rig import Quality, Rig, RigCamera
+from binpick.rigcheck.board import Board
 from binpick_calib import bundle as bundles
 from binpick_calib import consensus, lens, plausible, reasons
-from binpick_calib.board import Board
 from binpick_calib.bundle import Bundle, Seen
 from binpick_calib.consensus import Agreement, Both
 from binpick_calib.views import FEWEST_VIEWS, View, Views, sides

@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from binpick import geometry, rig
 from binpick.errors import InputError
-from binpick_calib import board as boards
+from binpick.rigcheck import board as boards
+from binpick.rigcheck import sight
+from binpick.rigcheck.detection import Detection
 from binpick_calib import cli, solve, views
 
 SAMPLES = Path(__file__).parents[2] / "../shared/data/opencv_samples"
@@ -115,10 +117,10 @@ def test_board_that_looks_the_same_upside_down() -> None:
 
 def test_a_turned_image_numbers_the_same_printed_corner(shots: Path) -> None:
     image = cv2.imread(str(shots / "Left02.png"), cv2.IMREAD_GRAYSCALE)
-    upright, turned = boards.find(image, BOARD), boards.find(np.ascontiguousarray(image[::-1, ::-1]), BOARD)
-    assert upright is not None
-    assert turned is not None
-    assert turned == pytest.approx(np.array(SIZE) - 1 - upright, abs=0.05)
+    upright, turned = sight.find(image, BOARD), sight.find(np.ascontiguousarray(image[::-1, ::-1]), BOARD)
+    assert isinstance(upright, Detection)
+    assert isinstance(turned, Detection)
+    assert turned.corners_px == pytest.approx(np.array(SIZE) - 1 - upright.corners_px, abs=0.05)
 
 
 @pytest.mark.parametrize(("spec", "said"), [

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from binpick import geometry, rig
 from binpick.errors import InputError
-from binpick_calib import board as boards
+from binpick.rigcheck import board as boards
 from binpick_calib import lens, plausible, solve, views
 
 BOARD = boards.Board(9, 6, 0.025)
