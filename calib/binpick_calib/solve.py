@@ -149,12 +149,17 @@ def _solution(fitted: Bundle, kept: Sequence[Seen], model: str, views: Views, re
 
 def _sigma(fitted: Bundle, names: Sequence[str], model: str) -> dict[str, float]:
     """The deviations by name; for the step of a camera its distance (along it) and its turn (all axes together)."""
-    told = {f"{name}.{TERMS[i]}": float(spread[i]) for name, spread in zip(names, fitted.deviations, strict=True)
-            for i in (0, 1, 2, 3, *(bundles.PINHOLE + term for term in lens.MODELS[model]))}
-    for name, T, spread in zip(names[1:], fitted.T_cam_rig[1:], fitted.step_deviations, strict=True):
-        along = T[:3, 3] / np.linalg.norm(T[:3, 3])
-        told[f"{name}.distance_m"] = float(np.linalg.norm(along * spread[3:]))
-        told[f"{name}.turn_rad"] = float(np.linalg.norm(spread[:3]))
+    assert fitted.covariance is not None
+    unknowns = np.eye(len(fitted.covariance.scatter))
+    spread, told = fitted.covariance.deviations(unknowns), {}
+    for camera, name in enumerate(names):
+        for i in (0, 1, 2, 3, *(bundles.PINHOLE + term for term in lens.MODELS[model])):
+            told[f"{name}.{TERMS[i]}"] = float(spread[12 * camera + i])
+    for number, (name, T) in enumerate(zip(names[1:], fitted.T_cam_rig[1:], strict=True)):
+        turn = 12 * len(names) + 6 * number
+        along = T[:3, 3] / np.linalg.norm(T[:3, 3]) @ unknowns[turn + 3:turn + 6]
+        told[f"{name}.distance_m"] = float(fitted.covariance.deviations(along[None])[0])
+        told[f"{name}.turn_rad"] = float(np.linalg.norm(spread[turn:turn + 3]))
     return told
 
 
