@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,11 +16,13 @@ from rich.table import Table
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick.rigcheck.board import Board, parse
-from binpick_calib import loose, vector
+from binpick_calib import loose, residuals, vector
 from binpick_calib import sheet as sheets
 from binpick_calib import views as viewing
+from binpick_calib.report import page
 from binpick_calib.solve import Solution
 from binpick_calib.solve import solve as solve_views
+from binpick_calib.views import Shot
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -38,6 +41,7 @@ def solve(
     out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
     camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page for people, too: report.html.")] = None,
 ) -> None:
     """Calibrate two or more cameras from images of a board.
 
@@ -47,20 +51,55 @@ def solve(
     that comes out cannot be, nothing is written.
     """
     spec = parse(board)
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
+    for option, file in (("--out", out), ("--report", report)):
+        if file is not None and not file.parent.is_dir():
+            raise InputError(f"{option} {file}: there is no folder {file.parent}")
     shots, alone = viewing.match(left, right, *(camera or ()))
-    screen = Console(stderr=True)
-    watched = track(shots, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
-    views = viewing.detect(watched, spec)
+    views = _seen(shots, spec)
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
     _write(out, rigs.dump(solution.rig))
-    unused = alone | views.rejected
+    if report is not None:
+        page.write(report, page.of(solution.rig, residuals.of(solution.rig, views, spec), spec, shots))
+    unused = alone | solution.quality.rejected
     if as_json:
         typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
     else:
         show(Console(), solution, spec, unused)
-        typer.echo(f"Written: {out}")
+        typer.echo(f"Written: {out}" + (f", {report}" if report else ""))
+
+
+def _seen(shots: Sequence[Shot], board: Board) -> viewing.Views:
+    """The board in every shot; people see how far it is."""
+    screen = Console(stderr=True)
+    return viewing.detect(track(shots, description="Finding the board", console=screen, transient=True,
+                                disable=not screen.is_terminal), board)
+
+
+@app.command("report")
+def write_report(
+    rig: Annotated[Path, typer.Option(metavar="FILE", help="The rig file.")],
+    left: Annotated[str, typer.Option(metavar="GLOB", help="Images of the left camera that it was made of, quoted.")],
+    right: Annotated[str, typer.Option(metavar="GLOB", help="Images of the right camera.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write: report.html.")],
+    camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
+    board: Annotated[str | None, typer.Option(metavar="SPEC", help="The board, where the rig file does not name it.")] = None,
+) -> None:
+    """Write a page that shows what a calibration is worth.
+
+    Residuals by place and by view, coverage, rectified pairs, depth errors to expect, the matrices to
+    copy, and what to do better: one HTML file that needs no other and can be printed.
+    """
+    calibrated, warnings = rigs.load(rig)
+    for warning in warnings:
+        typer.echo(f"binpick-calib: {warning}", err=True)
+    if board is None and calibrated.board is None:
+        raise InputError(f"{rig}: it does not say which board it was made of; give --board")
+    if len(calibrated.cameras) != 2 + len(camera or ()):
+        raise InputError(f"{rig}: it has {len(calibrated.cameras)} cameras; give images of each (--camera for further ones)")
+    spec = parse(board or str(calibrated.board))
+    shots, _ = viewing.match(left, right, *(camera or ()))
+    page.write(out, page.of(calibrated, residuals.of(calibrated, _seen(shots, spec), spec), spec, shots))
+    typer.echo(f"Written: {out}")
 
 
 @app.command(name="import")

@@ -34,13 +34,15 @@ class Shot:
 class View:
     """The corners of one shot, for each camera in the order of the board's points; NaN = this corner was not seen.
 
-    Any detector may fill it. `blur_px`: sigma of the printed edges in each image, NaN = not measured.
+    Any detector may fill it. `blur_px`: sigma of the printed edges in each image, NaN = not measured. `seen`: the detections
+    themselves, where there are any.
     """
 
     number: int
     names: tuple[str, ...]
     corners_px: tuple[Float32[np.ndarray, "_ 2"], ...]
     blur_px: tuple[float, ...]
+    seen: tuple[Detection | None, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +137,7 @@ def view(shot: Shot, board: Board, seen: Sequence[Detection | None]) -> View:
             px[found.ids] = found.corners_px
         corners.append(px)
     return View(shot.number, tuple("" if path is None else path.name for path in shot.files), tuple(corners),
-                tuple(np.nan if found is None else found.quality.blur_px for found in seen))
+                tuple(np.nan if found is None else found.quality.blur_px for found in seen), tuple(seen))
 
 
 def _read(path: Path) -> UInt8[np.ndarray, "h w"] | None:

@@ -1,0 +1,55 @@
+"""Pictures: photographs inside the page: rectified pairs under scan lines, and small prints of what was not used."""
+
+import base64
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from binpick.data import Image
+from binpick.rig import Rig
+from binpick_calib.residuals import rectification
+
+PAIR_PX = 560
+"""Width of each picture of a pair: two of them side by side still show a row's error of two pixels."""
+THUMB_PX = 200
+SCAN_LINES = 15
+
+
+def read(path: Path) -> Image | None:
+    """The picture in grey; None when it cannot be read."""
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def png(image: Image) -> str:
+    """The picture as an address that holds it."""
+    return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode("ascii")
+
+
+def small(image: Image, width: int) -> Image:
+    """At most that wide."""
+    if image.shape[1] <= width:
+        return image
+    return np.asarray(cv2.resize(image, (width, round(image.shape[0] * width / image.shape[1])), interpolation=cv2.INTER_AREA),
+                      dtype=np.uint8)
+
+
+def thumbnail(path: Path) -> str:
+    """An `img`, or a word where there is no picture."""
+    image = read(path)
+    return '<span class="none">cannot be shown</span>' if image is None else f'<img alt="" src="{png(small(image, THUMB_PX))}">'
+
+
+def rectified(rig: Rig, left: Image, right: Image) -> str:
+    """Both pictures turned onto common rows, side by side, with lines right across: a line meets the same corner in both."""
+    own, other = rig.cameras[:2]
+    R1, R2, P1, P2, _ = rectification(rig)
+    flat = []
+    for image, camera, R, P in ((left, own, R1, P1), (right, other, R2, P2)):
+        maps = cv2.initUndistortRectifyMap(camera.K_px, camera.distortion_coefficients, R, P, rig.image_size_px, cv2.CV_32FC1)
+        flat.append(small(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), dtype=np.uint8), PAIR_PX))
+    both = np.hstack(flat)
+    height, width = both.shape
+    lines = "".join(f"M0 {(n + 0.5) * height / SCAN_LINES:.1f}H{width}" for n in range(SCAN_LINES))
+    return (f'<svg class="pair" viewBox="0 0 {width} {height}" role="img"><image width="{width}" height="{height}" '
+            f'href="{png(both)}"/><path class="scan" d="{lines}"/></svg>')
