@@ -68,10 +68,10 @@ def _determined(rig: Rig) -> Iterator[str]:
 def _views(fit: Residuals) -> Iterator[str]:
     whole = {view: float(np.sqrt(np.nanmean(np.square(each)))) for view, each in fit.per_view_px().items()}
     usual = float(np.median(list(whole.values())))
-    odd = [str(view) for view, px in whole.items() if px > STANDING_OUT * usual]
+    odd = [f"view {view}" for view, px in whole.items() if px > STANDING_OUT * usual]
     if odd:
-        yield (f"View{'s' if len(odd) > 1 else ''} {', '.join(odd)} fit{'' if len(odd) > 1 else 's'} more than "
-                   f"{STANDING_OUT} times worse than the others: look for blur, glare and a bent board there, and take such a view again.")
+        yield (f"Fitting more than {STANDING_OUT} times worse than the others: {', '.join(odd)}. Look there for blur, glare "
+               "and a bent board, and take such views again.")
     if 4 * len(fit.rejected) > len(whole):
         yield (f"{len(fit.rejected)} images or pairs were not used beside {len(whole)} that were: see their reasons below, "
                "and take such views again.")

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,7 +60,8 @@ def solve(
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
     _write(out, rigs.dump(solution.rig))
     if report is not None:
-        page.write(report, page.of(solution.rig, residuals.of(solution.rig, views, spec), spec, shots))
+        fit = residuals.of(solution.rig, replace(views, rejected=alone | views.rejected), spec)
+        page.write(report, page.of(solution.rig, fit, spec, shots))
     unused = alone | solution.quality.rejected
     if as_json:
         typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
@@ -97,8 +99,10 @@ def write_report(
     if len(calibrated.cameras) != 2 + len(camera or ()):
         raise InputError(f"{rig}: it has {len(calibrated.cameras)} cameras; give images of each (--camera for further ones)")
     spec = parse(board or str(calibrated.board))
-    shots, _ = viewing.match(left, right, *(camera or ()))
-    page.write(out, page.of(calibrated, residuals.of(calibrated, _seen(shots, spec), spec), spec, shots))
+    shots, alone = viewing.match(left, right, *(camera or ()))
+    views = _seen(shots, spec)
+    fit = residuals.of(calibrated, replace(views, rejected=alone | views.rejected), spec)
+    page.write(out, page.of(calibrated, fit, spec, shots))
     typer.echo(f"Written: {out}")
 
 

@@ -12,13 +12,16 @@ from binpick_calib.bundle import Bundle, Lens
 
 MATCHED_PX = 0.1
 """One sigma of a disparity where the parts have texture: 0.05 px in the median of plane faces, 0.1 to 0.2 on round ones."""
-PLACES = (0.15, 0.5, 0.85)
+PLACES = tuple(tenth / 10 for tenth in range(1, 10))
 """Where in the image the calibration's share is asked for, of width and height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outlook:
-    """One sigma of depth at each distance, m: of the matching, and of the calibration in the image's middle and worst place."""
+    """One sigma of depth at each distance, m: of the matching, and of the calibration in the image's middle and worst place.
+
+    Places that the second camera does not see do not count; NaN: it sees none.
+    """
 
     distance_m: Float[np.ndarray, "n"]
     matching_m: Float[np.ndarray, "n"]
@@ -51,10 +54,11 @@ def of(fitted: Bundle, image_size_px: tuple[int, int], distance_m: Float[np.ndar
         if step[place]:
             slopes[:, place] = (_depth(unknowns + step, moving, left, right) - _depth(unknowns - step, moving, left, right)
                                 ) / (2 * step[place])
-    share = fitted.covariance.deviations(slopes).reshape(len(distance_m), -1)
+    inside = ((right >= 0) & (right < image_size_px)).all(axis=1)
+    share = np.where(inside, fitted.covariance.deviations(slopes), np.nan).reshape(len(distance_m), -1)
     baseline_m = np.linalg.norm(fitted.T_cam_rig[1][:3, 3])
     return Outlook(distance_m, np.asarray(distance_m**2 * MATCHED_PX / (fitted.lenses[0].values[0] * baseline_m)),
-                   share[:, share.shape[1] // 2], share.max(axis=1))
+                   share[:, share.shape[1] // 2], np.fmax.reduce(share, axis=1))
 
 
 def _seen(fitted: Bundle, image_size_px: tuple[int, int], z: float) -> tuple[np.ndarray, np.ndarray]:

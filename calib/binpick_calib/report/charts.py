@@ -31,32 +31,32 @@ def bars(values: dict[str, tuple[float, ...]], names: Sequence[str], unit: str) 
     keys = "".join(f'<rect class="camera{camera}" x="{LEFT + 110 * camera}" y="{HEIGHT - 13}" width="10" height="10"/>'
                    f'<text class="tick" x="{LEFT + 110 * camera + 15}" y="{HEIGHT - 4}">{name}</text>'
                    for camera, name in enumerate(names))
-    return _chart(_rows(0, top, unit) + drawn + line + keys)
+    return _chart(_rows(0.0, top, unit) + drawn + line + keys)
 
 
 def points(across: Sequence[float], up: Sequence[float], words: tuple[str, str]) -> str:
     """Dots over two axes, both from 0 or the least."""
     low, high = 0.9 * min(across), 1.1 * max(across)
     top = max(1.1 * max(up), 10.0)
-    dots = "".join(f'<circle class="camera0" r="5" cx="{_x(x, low, high):.1f}" cy="{_y(y, 0, top):.1f}"/>'
+    dots = "".join(f'<circle class="camera0" r="5" cx="{_x(x, low, high):.1f}" cy="{_y(y, 0.0, top):.1f}"/>'
                    for x, y in zip(across, up, strict=True))
-    return _chart(_rows(0, top, words[1]) + _columns(low, high, words[0]) + dots)
+    return _chart(_rows(0.0, top, words[1]) + _columns(low, high, words[0]) + dots)
 
 
 def depth(ahead: Outlook, shown_m: tuple[float, float]) -> str:
     """Millimetres of one sigma over metres of distance; shaded: where the board was."""
     far = ahead.distance_m
-    low, high, top = float(far[0]), float(far[-1]), 1050 * float(max(ahead.total_m.max(), ahead.worst_m.max()))
+    low, high, top = float(far[0]), float(far[-1]), 1050 * float(np.nanmax([ahead.total_m, ahead.worst_m, ahead.matching_m]))
     band = _x(shown_m[0], low, high), _x(shown_m[1], low, high)
     shade = f'<rect class="band" x="{band[0]:.1f}" y="{TOP}" width="{band[1] - band[0]:.1f}" height="{HEIGHT - TOP - BOTTOM}"/>'
     curves = "".join(f'<path class="curve {name}" d="{_curve(far, 1000 * sigma, low, high, top)}"/>' for name, sigma in (
         ("worst", ahead.worst_m), ("middle", ahead.middle_m), ("matching", ahead.matching_m), ("total", ahead.total_m)))
-    return _chart(shade + _rows(0, top, "mm") + _columns(low, high, "m") + curves)
+    return _chart(shade + _rows(0.0, top, "mm") + _columns(low, high, "m") + curves)
 
 
 def _curve(across: Float[np.ndarray, "n"], up: Float[np.ndarray, "n"], low: float, high: float, top: float) -> str:
-    return "M" + "L".join(f"{_x(x, low, high):.1f} {_y(y, 0, top):.1f}"
-                          for x, y in zip(across.tolist(), up.tolist(), strict=True))
+    return "M" + "L".join(f"{_x(x, low, high):.1f} {_y(y, 0.0, top):.1f}"
+                          for x, y in zip(across.tolist(), up.tolist(), strict=True) if np.isfinite(y))
 
 
 def _x(value: float, low: float, high: float) -> float:

@@ -37,7 +37,7 @@ def of(rig: Rig, fit: Residuals, board: Board, shots: Sequence[Shot]) -> str:
         ("Not used", "rejected", _rejected(fit.rejected, shots)),
         ("Coverage", "wide", _coverage(rig, fit, away_m)),
         ("Rectified pairs", "wide", _pairs(rig, shots, away_m)),
-        ("Rows and epipolar lines", "epipolar", tables.epipolar_errors(fit)),
+        ("Rows and epipolar lines", "wide", tables.epipolar_errors(fit)),
         ("What these images cannot tell, and rows cannot show later", "untold",
          _sentences(advice.untold(fit, board, float(np.median(list(away_m.values())))))),
         ("Matrices", "wide", _matrices(rig))]
@@ -93,9 +93,9 @@ def _sentences(told: Sequence[str]) -> str:
 def _residual_maps(rig: Rig, fit: Residuals) -> str:
     drawn = "".join(f"<figure>{maps.residuals(own, rig.image_size_px)}<figcaption>{escape(camera.name)}</figcaption></figure>"
                     for own, camera in zip(fit.misses, rig.cameras, strict=True))
-    return (f'<div class="row">{drawn}</div><p class="note">Thin arrows: from where the rig puts a corner to where it was seen. '
-            "Thick arrows: their mean in a part of the image; where these are long, the lens or the board bends there in a way "
-            "the model does not follow. Redder parts fit worse. The bar shows the scale of the arrows.</p>")
+    return (f'<div class="row">{drawn}</div><p class="note">Thin arrows: from where the rig puts a corner to where it was '
+            "seen. Thick arrows: their mean in a part of the image; where these are long, the lens or the board bends there in "
+            "a way the model does not follow. Redder parts fit worse. The bar shows the scale of the arrows.</p>")
 
 
 def _coverage(rig: Rig, fit: Residuals, away_m: dict[int, float]) -> str:
@@ -108,8 +108,8 @@ def _coverage(rig: Rig, fit: Residuals, away_m: dict[int, float]) -> str:
     chart = charts.points([away_m[view] for view in fit.boards], tilts, ("distance m", "tilt °"))
     sides = ", ".join(f"{tilt} {number}" for tilt, number in fit.coverage.tilts.items())
     return (f'<div class="row">{drawn}<figure>{chart}<figcaption>the board in each view</figcaption></figure></div>'
-            f'<p class="note">Views whose board had this side nearer: {sides}. The nearest board fills '
-            f"{fit.coverage.range:.2f} times as much of the image's width as the farthest. Hatched: no other camera sees it.</p>")
+            f'<p class="note">Views whose board had this side nearer: {sides}. The nearest board looks '
+            f"{fit.coverage.range:.2f} times as large as the farthest. Dashed parts: no other camera sees them.</p>")
 
 
 def _depth(ahead: Outlook, near_m: float, far_m: float) -> str:
@@ -122,10 +122,10 @@ def _depth(ahead: Outlook, near_m: float, far_m: float) -> str:
             + '<p class="keys"><i class="matching"></i>matching <i class="middle"></i>calibration, middle of the image '
               '<i class="worst"></i>calibration, worst place <i class="total"></i>both, middle</p>'
             + tables.table(("one sigma, mm", "matching", "calibration", "worst place", "both"), rows)
-            + f'<p class="note">Matching: Z² σ_d / (f b) with σ_d = {MATCHED_PX:g} px (Gallup, Frahm, Mordohai and Pollefeys, '
-              "Variable Baseline/Resolution Stereo, CVPR 2008). Calibration: the covariance of all parameters, of views rather than "
-              "corners where that is larger, through the triangulated depth (Hartley and Zisserman, Multiple View Geometry, 5.2). "
-              "Shaded: where the board was; beyond it the curves rest on the lens model alone.</p>")
+            + f'<p class="note">Matching: Z² σ_d / (f b) with σ_d = {MATCHED_PX:g} px (Gallup, Frahm, Mordohai, Pollefeys: '
+              "Variable Baseline/Resolution Stereo, CVPR 2008). Calibration: the covariance of all parameters together, of "
+              "views rather than corners where that is larger, through the triangulated depth (Hartley, Zisserman: Multiple "
+              "View Geometry, 5.2). Shaded: where the board was; beyond it the curves rest on the model alone.</p>")
 
 
 def _rejected(reasons: dict[str, str], shots: Sequence[Shot]) -> str:
@@ -143,13 +143,13 @@ def _rejected(reasons: dict[str, str], shots: Sequence[Shot]) -> str:
 def _pairs(rig: Rig, shots: Sequence[Shot], away_m: dict[int, float]) -> str:
     by_distance = sorted(away_m, key=lambda view: away_m[view])
     chosen = [by_distance[place] for place in np.linspace(0, len(by_distance) - 1, PAIRS).round().astype(int)]
+    files = {shot.number: shot.files for shot in shots}
     drawn = ""
-    for shot in shots:
-        if shot.number in chosen and shot.files[1] is not None and shot.files[0] is not None:
-            left, right = (pictures.read(path) for path in (shot.files[0], shot.files[1]))
-            if left is not None and right is not None:
-                drawn += (f"<figure>{pictures.rectified(rig, left, right)}<figcaption>view {shot.number}, "
-                          f"{away_m[shot.number]:.3f} m</figcaption></figure>")
+    for view in dict.fromkeys(chosen):
+        left, right = (None if path is None else pictures.read(path) for path in files[view][:2])
+        if left is not None and right is not None:
+            drawn += (f"<figure>{pictures.rectified(rig, left, right)}<figcaption>view {view}, board at {away_m[view]:.3f} m"
+                      "</figcaption></figure>")
     return f'{drawn}<p class="note">After rectification a line meets the same things in both pictures.</p>'
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from binpick.data import Image
 from binpick.rig import Rig
@@ -26,7 +27,7 @@ def png(image: Image) -> str:
     return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode("ascii")
 
 
-def small(image: Image, width: int) -> Image:
+def small(image: Image, width: int) -> UInt8[np.ndarray, "_ _"]:
     """At most that wide."""
     if image.shape[1] <= width:
         return image
