@@ -160,7 +160,8 @@ def _sigma(fitted: Bundle, names: Sequence[str], model: str) -> dict[str, float]
         along = T[:3, 3] / np.linalg.norm(T[:3, 3]) @ unknowns[turn + 3:turn + 6]
         told[f"{name}.distance_m"] = float(fitted.covariance.deviations(along[None])[0])
         told[f"{name}.turn_rad"] = float(np.linalg.norm(spread[turn:turn + 3]))
-    return told
+    # products of large matrices end differently in their last digits where BLAS has more threads
+    return {key: float(f"{deviation:.6g}") for key, deviation in told.items()}
 
 
 def _row_error_px(kept: Sequence[Seen], fitted: Bundle, image_size_px: tuple[int, int]) -> float:
