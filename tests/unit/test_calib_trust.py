@@ -168,6 +168,14 @@ def test_absurd_distortion() -> None:
     assert not lens.folds(K, np.array([-0.28, 0.09, 0, 0, 0.0]), SIZE)
 
 
+def test_a_first_guess_does_not_run_away() -> None:
+    # the board's vanishing points say 11420 px for the right lens of this set
+    all_views = seen(number=10, noise_px=0.15, tilt_deg=20, seed=1014)
+    solution = solve.solve(all_views, BOARD, "2026-01-01")
+    assert solution.quality.rejected == {}
+    assert [camera.K[0][0] for camera in solution.rig.cameras] == pytest.approx([620, 620], rel=0.02)
+
+
 def test_same_views_same_bytes() -> None:
     all_views = seen(number=6)
     first = rig.dump(solve.solve(all_views, BOARD, "2026-01-01").rig)
