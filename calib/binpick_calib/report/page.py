@@ -60,7 +60,7 @@ def write(out: Path, content: str) -> None:
 def _head(rig: Rig, fit: Residuals, board: Board) -> str:
     left, right = rig.cameras[:2]
     baseline_m = float(np.linalg.norm(right.T_camera_rig[:3, 3]))
-    sound = fit.rows.error_px <= advice.ROW_PX and fit.rms_px <= advice.RMS_PX
+    sound = fit.rows.error_px <= advice.ROW_PX and fit.rms_px <= advice.RMS_PX and _alike(rig, fit)
     tiles = {"rms_px": ("residual, rms", f"{fit.rms_px:.3f} px"),
              "row_px": ("row error, median", f"{fit.rows.error_px:.3f} px"),
              "baseline_m": ("baseline", f"{1000 * baseline_m:.2f} mm"),

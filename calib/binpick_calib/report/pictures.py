@@ -42,13 +42,22 @@ def thumbnail(path: Path) -> str:
 
 
 def rectified(rig: Rig, left: Image, right: Image) -> str:
-    """Both pictures turned onto common rows, side by side, with lines right across: a line meets the same corner in both."""
-    own, other = rig.cameras[:2]
+    """Both pictures turned onto common rows, side by side, with lines right across: a line meets the same corner in both.
+
+    Each is slid along its rows until its middle is in view, which a verged pair's would not be.
+    """
     R1, R2, P1, P2, _ = rectification(rig)
+    size = np.array(rig.image_size_px)
+    sides = list(zip((left, right), rig.cameras[:2], (R1, R2), (P1[:, :3].copy(), P2[:, :3].copy()), strict=True))
+    middles = [cv2.undistortPoints(size / 2, c.K_px, c.distortion_coefficients, R=R, P=P)[0, 0] for _, c, R, P in sides]
+    down = float(np.mean([size[1] / 2 - middle[1] for middle in middles]))
     flat = []
-    for image, camera, R, P in ((left, own, R1, P1), (right, other, R2, P2)):
+    for (image, camera, R, P), middle in zip(sides, middles, strict=True):
+        P[:2, 2] += size[0] / 2 - middle[0], down
         maps = cv2.initUndistortRectifyMap(camera.K_px, camera.distortion_coefficients, R, P, rig.image_size_px, cv2.CV_32FC1)
-        flat.append(small(np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), dtype=np.uint8), PAIR_PX))
+        bright = cv2.convertScaleAbs(image, alpha=255 / max(float(np.quantile(image, 0.99)), 1.0))
+        turned = cv2.remap(bright, *maps, cv2.INTER_LINEAR)
+        flat.append(small(np.asarray(turned, dtype=np.uint8), PAIR_PX))
     both = np.hstack(flat)
     height, width = both.shape
     lines = "".join(f"M0 {(n + 0.5) * height / SCAN_LINES:.1f}H{width}" for n in range(SCAN_LINES))
