@@ -110,7 +110,7 @@ def detect(shots: Iterable[Shot], board: Board) -> Views:
     for shot in shots:
         seen: list[Detection | None] = []
         for path in shot.files:
-            image = None if path is None else _read(path)
+            image = None if path is None else read(path)
             if path is not None and image is not None:
                 size = size or (image.shape[1], image.shape[0])
                 _same_size(path, image, size)
@@ -140,7 +140,8 @@ def view(shot: Shot, board: Board, seen: Sequence[Detection | None]) -> View:
                 tuple(np.nan if found is None else found.quality.blur_px for found in seen), tuple(seen))
 
 
-def _read(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+def read(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+    """An image file in grey, as its pixels lie; None when it is none."""
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 

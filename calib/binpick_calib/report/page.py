@@ -14,7 +14,7 @@ from binpick_calib import advice, outlook, residuals
 from binpick_calib.outlook import MATCHED_PX, Outlook
 from binpick_calib.report import charts, maps, pictures, tables
 from binpick_calib.residuals import Residuals
-from binpick_calib.views import Shot
+from binpick_calib.views import Shot, read
 
 PAIRS = 3
 """Rectified pairs that are shown: the nearest, the middle and the farthest."""
@@ -146,7 +146,7 @@ def _pairs(rig: Rig, shots: Sequence[Shot], away_m: dict[int, float]) -> str:
     files = {shot.number: shot.files for shot in shots}
     drawn = ""
     for view in dict.fromkeys(chosen):
-        left, right = (None if path is None else pictures.read(path) for path in files[view][:2])
+        left, right = (None if path is None else read(path) for path in files[view][:2])
         if left is not None and right is not None:
             drawn += (f"<figure>{pictures.rectified(rig, left, right)}<figcaption>view {view}, board at {away_m[view]:.3f} m"
                       "</figcaption></figure>")

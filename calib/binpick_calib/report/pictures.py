@@ -10,16 +10,12 @@ from jaxtyping import UInt8
 from binpick.data import Image
 from binpick.rig import Rig
 from binpick_calib.residuals import rectification
+from binpick_calib.views import read
 
 PAIR_PX = 560
 """Width of each picture of a pair: two of them side by side still show a row's error of two pixels."""
 THUMB_PX = 200
 SCAN_LINES = 15
-
-
-def read(path: Path) -> Image | None:
-    """The picture in grey; None when it cannot be read."""
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def png(image: Image) -> str:
