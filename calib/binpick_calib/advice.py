@@ -27,7 +27,7 @@ LEANING = 0.5
 
 def of(rig: Rig, fit: Residuals, ahead: Outlook) -> list[str]:
     """What to do, most telling first; a single sentence of praise when there is nothing."""
-    told = [*_residual(fit), *_determined(rig), *_views(fit), *_depth(ahead)]
+    told = [*_outlying(fit), *_residual(fit), *_determined(rig), *_unused(fit), *_depth(ahead)]
     told += [f"Take a view that shows {missing}." if "more views" not in missing else f"Take {missing}."
              for missing in fit.coverage.missing] if fit.coverage.views else []
     return told or ["Nothing: every figure is where it should be. Keep these images, and verify the rig after each knock."]
@@ -65,15 +65,18 @@ def _determined(rig: Rig) -> Iterator[str]:
                    f"({100 * loose_px / camera.K_px[0, 0]:.2f} %): tilt the board by 20 to 40 degrees, every way.")
 
 
-def _views(fit: Residuals) -> Iterator[str]:
+def _outlying(fit: Residuals) -> Iterator[str]:
     whole = {view: float(np.sqrt(np.nanmean(np.square(each)))) for view, each in fit.per_view_px().items()}
     usual = float(np.median(list(whole.values())))
     odd = [f"view {view}" for view, px in whole.items() if px > STANDING_OUT * usual]
     if odd:
         yield (f"Fitting more than {STANDING_OUT} times worse than the others: {', '.join(odd)}. Look there for blur, glare "
                "and a bent board, and take such views again.")
-    if 4 * len(fit.rejected) > len(whole):
-        yield (f"{len(fit.rejected)} images or pairs were not used beside {len(whole)} that were: see their reasons below, "
+
+
+def _unused(fit: Residuals) -> Iterator[str]:
+    if 4 * len(fit.rejected) > len(fit.boards):
+        yield (f"{len(fit.rejected)} images or pairs were not used beside {len(fit.boards)} that were: see the reasons below, "
                "and take such views again.")
 
 
