@@ -2,6 +2,8 @@
 
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,13 +17,14 @@ from rich.table import Table
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick.poses import PoseFormat
-from binpick_calib import board as boards
-from binpick_calib import loose, vector
+from binpick.rigcheck.board import Board, parse
+from binpick_calib import loose, residuals, vector
 from binpick_calib import sheet as sheets
 from binpick_calib import views as viewing
-from binpick_calib.board import Board
+from binpick_calib.report import page
 from binpick_calib.solve import Solution
 from binpick_calib.solve import solve as solve_views
+from binpick_calib.views import Shot
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -40,6 +43,7 @@ def solve(
     out: Annotated[Path, typer.Option(metavar="FILE", help="The rig file to write.")],
     camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a page for people, too: report.html.")] = None,
 ) -> None:
     """Calibrate two or more cameras from images of a board.
 
@@ -48,21 +52,59 @@ def solve(
     disagree with the others are left out and named, with the reason; if most disagree, or the rig
     that comes out cannot be, nothing is written.
     """
-    spec = boards.parse(board)
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
+    spec = parse(board)
+    for option, file in (("--out", out), ("--report", report)):
+        if file is not None and not file.parent.is_dir():
+            raise InputError(f"{option} {file}: there is no folder {file.parent}")
     shots, alone = viewing.match(left, right, *(camera or ()))
-    screen = Console(stderr=True)
-    watched = track(shots, description="Finding the board", console=screen, transient=True, disable=not screen.is_terminal)
-    views = viewing.detect(watched, spec)
+    views = _seen(shots, spec)
     solution = solve_views(views, spec, datetime.now(UTC).isoformat(timespec="seconds"))
     _write(out, rigs.dump(solution.rig))
-    unused = alone | views.rejected
+    if report is not None:
+        fit = residuals.of(solution.rig, replace(views, rejected=alone | views.rejected), spec)
+        page.write(report, page.of(solution.rig, fit, spec, shots))
+    unused = alone | solution.quality.rejected
     if as_json:
         typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
     else:
         show(Console(), solution, spec, unused)
-        typer.echo(f"Written: {out}")
+        typer.echo(f"Written: {out}" + (f", {report}" if report else ""))
+
+
+def _seen(shots: Sequence[Shot], board: Board) -> viewing.Views:
+    """The board in every shot; people see how far it is."""
+    screen = Console(stderr=True)
+    return viewing.detect(track(shots, description="Finding the board", console=screen, transient=True,
+                                disable=not screen.is_terminal), board)
+
+
+@app.command("report")
+def write_report(
+    rig: Annotated[Path, typer.Option(metavar="FILE", help="The rig file.")],
+    left: Annotated[str, typer.Option(metavar="GLOB", help="Images of the left camera that it was made of, quoted.")],
+    right: Annotated[str, typer.Option(metavar="GLOB", help="Images of the right camera.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write: report.html.")],
+    camera: Annotated[list[str] | None, typer.Option(metavar="GLOB", help="Images of a further camera.")] = None,
+    board: Annotated[str | None, typer.Option(metavar="SPEC", help="The board, where the rig file does not name it.")] = None,
+) -> None:
+    """Write a page that shows what a calibration is worth.
+
+    Residuals by place and by view, coverage, rectified pairs, depth errors to expect, the matrices to
+    copy, and what to do better: one HTML file that needs no other and can be printed.
+    """
+    calibrated, warnings = rigs.load(rig)
+    for warning in warnings:
+        typer.echo(f"binpick-calib: {warning}", err=True)
+    if board is None and calibrated.board is None:
+        raise InputError(f"{rig}: it does not say which board it was made of; give --board")
+    if len(calibrated.cameras) != 2 + len(camera or ()):
+        raise InputError(f"{rig}: it has {len(calibrated.cameras)} cameras; give images of each (--camera for further ones)")
+    spec = parse(board or str(calibrated.board))
+    shots, alone = viewing.match(left, right, *(camera or ()))
+    views = _seen(shots, spec)
+    fit = residuals.of(calibrated, replace(views, rejected=alone | views.rejected), spec)
+    page.write(out, page.of(calibrated, fit, spec, shots))
+    typer.echo(f"Written: {out}")
 
 
 @app.command(name="import")
@@ -164,7 +206,7 @@ def print_board(
     """Write a board to print at true scale, with a ruler of 100 mm to check the print by."""
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise InputError(f"--out {out}: write a .pdf or an .svg file")
-    sheet = sheets.layout(boards.parse(board), page)
+    sheet = sheets.layout(parse(board), page)
     _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
     typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
 

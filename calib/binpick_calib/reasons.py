@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from binpick import geometry
-from binpick_calib import board as boards
 from binpick_calib import bundle as bundles
 from binpick_calib.bundle import Seen
 from binpick_calib.consensus import Agreement, Both, misfit_px
@@ -37,10 +37,15 @@ def reason(pair: Both, pairs: Sequence[Both], found: Agreement, width_px: int) -
     return _moved(pair, found)
 
 
-def _aligned(first: Seen, second: Seen) -> np.ndarray:
+def _aligned(first: Seen, second: Seen) -> Float[np.ndarray, "n 2"]:
+    """The second image's corners, numbered from the other end when the board lies the other way in it.
+
+    Cameras of a rig stand upright to each other within far less than 90 degrees. A board seen in part carries numbers.
+    """
     if len(first.px) != len(second.px):
         return second.px
-    return boards.align(first.px.astype(np.float32), second.px.astype(np.float32)).astype(float)
+    same_way = (first.px[-1] - first.px[0]) @ (second.px[-1] - second.px[0]) > 0
+    return second.px if same_way else second.px[::-1]
 
 
 def mirrored(seen: Seen, width_px: int) -> Seen:

@@ -9,9 +9,9 @@ import numpy as np
 from binpick import geometry
 from binpick.errors import InputError
 from binpick.rig import Quality, Rig, RigCamera
+from binpick.rigcheck.board import Board
 from binpick_calib import bundle as bundles
 from binpick_calib import consensus, lens, plausible, reasons
-from binpick_calib.board import Board
 from binpick_calib.bundle import Bundle, Seen
 from binpick_calib.consensus import Agreement, Both
 from binpick_calib.views import FEWEST_VIEWS, View, Views, sides
@@ -149,13 +149,19 @@ def _solution(fitted: Bundle, kept: Sequence[Seen], model: str, views: Views, re
 
 def _sigma(fitted: Bundle, names: Sequence[str], model: str) -> dict[str, float]:
     """The deviations by name; for the step of a camera its distance (along it) and its turn (all axes together)."""
-    told = {f"{name}.{TERMS[i]}": float(spread[i]) for name, spread in zip(names, fitted.deviations, strict=True)
-            for i in (0, 1, 2, 3, *(bundles.PINHOLE + term for term in lens.MODELS[model]))}
-    for name, T, spread in zip(names[1:], fitted.T_cam_rig[1:], fitted.step_deviations, strict=True):
-        along = T[:3, 3] / np.linalg.norm(T[:3, 3])
-        told[f"{name}.distance_m"] = float(np.linalg.norm(along * spread[3:]))
-        told[f"{name}.turn_rad"] = float(np.linalg.norm(spread[:3]))
-    return told
+    assert fitted.covariance is not None
+    unknowns = np.eye(len(fitted.covariance.scatter))
+    spread, told = fitted.covariance.deviations(unknowns), {}
+    for camera, name in enumerate(names):
+        for i in (0, 1, 2, 3, *(bundles.PINHOLE + term for term in lens.MODELS[model])):
+            told[f"{name}.{TERMS[i]}"] = float(spread[12 * camera + i])
+    for number, (name, T) in enumerate(zip(names[1:], fitted.T_cam_rig[1:], strict=True)):
+        turn = 12 * len(names) + 6 * number
+        along = T[:3, 3] / np.linalg.norm(T[:3, 3]) @ unknowns[turn + 3:turn + 6]
+        told[f"{name}.distance_m"] = float(fitted.covariance.deviations(along[None])[0])
+        told[f"{name}.turn_rad"] = float(np.linalg.norm(spread[turn:turn + 3]))
+    # products of large matrices end differently in their last digits where BLAS has more threads
+    return {key: float(f"{deviation:.6g}") for key, deviation in told.items()}
 
 
 def _row_error_px(kept: Sequence[Seen], fitted: Bundle, image_size_px: tuple[int, int]) -> float:

@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from binpick.errors import ImageError, InputError
-from binpick_calib import board as boards
-from binpick_calib.board import Board
+from binpick.rigcheck import sight
+from binpick.rigcheck.board import Board
+from binpick.rigcheck.detection import Detection, Refusal
 
 FEWEST_VIEWS = 5
 FEWEST_CORNERS = 8
 """Of a board seen in part: fewer leave its tilt to chance."""
-BLURRED = 1.7
-"""Times the median width of an edge: of one lens and one board, sharp views differ by 1.4 at most (far and oblique ones)."""
+BLURRED = 1.6
+"""Times the median sigma of the edges: of one lens and one board, sharp views differ by 1.15 at most (far and oblique ones)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +34,15 @@ class Shot:
 class View:
     """The corners of one shot, for each camera in the order of the board's points; NaN = this corner was not seen.
 
-    Any detector may fill it. `edge_px`: the width of the printed edges in each image (10 to 90 %), NaN = not measured.
+    Any detector may fill it. `blur_px`: sigma of the printed edges in each image, NaN = not measured. `seen`: the detections
+    themselves, where there are any.
     """
 
     number: int
     names: tuple[str, ...]
     corners_px: tuple[Float32[np.ndarray, "_ 2"], ...]
-    edge_px: tuple[float, ...]
+    blur_px: tuple[float, ...]
+    seen: tuple[Detection | None, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,26 +109,19 @@ def detect(shots: Iterable[Shot], board: Board) -> Views:
     used: list[View] = []
     rejected: dict[str, str] = {}
     for shot in shots:
-        corners, edges = [], []
+        seen: list[Detection | None] = []
         for path in shot.files:
-            seen, edge = np.full((board.columns * board.rows, 2), np.nan, np.float32), np.nan
-            if path is not None:
-                image = _read(path)
-                if image is None:
-                    rejected[path.name] = "cannot be read as an image"
-                else:
-                    size = size or (image.shape[1], image.shape[0])
-                    _same_size(path, image, size)
-                    found = boards.find(image, board)
-                    if found is None:
-                        rejected[path.name] = f"no board with {board.columns}x{board.rows} inner corners seen"
-                    else:
-                        seen, edge = found, boards.edge_px(image, found, board)
-            corners.append(seen)
-            edges.append(edge)
-        aligned = [corners[0], *(boards.align(corners[0], other) for other in corners[1:])]
-        names = tuple("" if path is None else path.name for path in shot.files)
-        used.append(View(shot.number, names, tuple(aligned), tuple(edges)))
+            image = None if path is None else read(path)
+            if path is not None and image is not None:
+                size = size or (image.shape[1], image.shape[0])
+                _same_size(path, image, size)
+            found = Refusal("cannot be read as an image") if image is None else sight.find(image, board)
+            if path is not None and seen and seen[0] is not None and isinstance(found, Detection):
+                found = sight.align(seen[0], found)
+            if path is not None and isinstance(found, Refusal):
+                rejected[path.name] = found.reason
+            seen.append(found if isinstance(found, Detection) else None)
+        used.append(view(shot, board, seen))
     sharp, blurred = screen(used)
     rejected |= blurred
     if size is None or len(sharp) < FEWEST_VIEWS:
@@ -133,7 +129,20 @@ def detect(shots: Iterable[Shot], board: Board) -> Views:
     return Views(size, sharp, rejected)
 
 
-def _read(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+def view(shot: Shot, board: Board, seen: Sequence[Detection | None]) -> View:
+    """One moment's detections, one of each camera and numbered alike, as arrays over all of the board's points."""
+    corners = []
+    for found in seen:
+        px = np.full((board.columns * board.rows, 2), np.nan, np.float32)
+        if found is not None:
+            px[found.ids] = found.corners_px
+        corners.append(px)
+    return View(shot.number, tuple("" if path is None else path.name for path in shot.files), tuple(corners),
+                tuple(np.nan if found is None else found.quality.blur_px for found in seen), tuple(seen))
+
+
+def read(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+    """An image file in grey, as its pixels lie; None when it is none."""
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
@@ -146,15 +155,15 @@ def _same_size(path: Path, image: UInt8[np.ndarray, "h w"], size: tuple[int, int
 
 def screen(views: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
     """The views that the first and one more camera see sharply and wholly enough, and the reason of each image that is not."""
-    typical = [np.nanmedian(widths) if np.isfinite(widths).any() else np.inf
-               for widths in np.array([view.edge_px for view in views]).T]
+    typical = [np.nanmedian(blurs) if np.isfinite(blurs).any() else np.inf
+               for blurs in np.array([view.blur_px for view in views]).T]
     kept, rejected = [], {}
     for view in views:
         corners = list(view.corners_px)
-        for camera, (name, px, edge) in enumerate(zip(view.names, view.corners_px, view.edge_px, strict=True)):
+        for camera, (name, px, blur) in enumerate(zip(view.names, view.corners_px, view.blur_px, strict=True)):
             seen = int(np.isfinite(px).all(axis=1).sum())
-            if edge > BLURRED * typical[camera]:
-                rejected[name] = f"blurred: its edges are {edge:.1f} px wide, those of the other views {typical[camera]:.1f} px"
+            if blur > BLURRED * typical[camera]:
+                rejected[name] = f"blurred: sigma of its edges is {blur:.1f} px, in the other views {typical[camera]:.1f} px"
             elif 0 < seen < FEWEST_CORNERS:
                 rejected[name] = f"half seen: {seen} of {len(px)} corners"
             else:

@@ -56,7 +56,7 @@ class Quality(Part):
 
     `hand_eye_rms_m` and `hand_eye_rms_rad`: how well T_base_rig or T_flange_rig agree with the robot, absent if never measured.
     `distortion_model`: the terms there was evidence for. `sigma`: one standard deviation of the parameters, by name and unit,
-    from the scatter of the corners alone: what every view has wrong in common (a bent board) is not in it.
+    from the scatter of the corners and of the views: what every view has wrong in common (a wrong scale) is not in it.
     """
 
     rms_px: float

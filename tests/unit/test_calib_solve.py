@@ -10,11 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from binpick import geometry, rig
 from binpick.errors import InputError
-from binpick_calib import board as boards
-from binpick_calib import cli, solve, views
+from binpick.rigcheck import board as boards
+from binpick.rigcheck import sight
+from binpick.rigcheck.detection import Detection
+from binpick_calib import cli, views
 
 SAMPLES = Path(__file__).parents[2] / "../shared/data/opencv_samples"
 TITANIA = Path(__file__).parents[2] / "../shared/data/i3dr_titania/checker_sample"
+needs_samples = pytest.mark.skipif(not SAMPLES.is_dir(), reason="OpenCV's stereo samples do not lie in ../shared/data")
+needs_titania = pytest.mark.skipif(not TITANIA.is_dir(), reason="the industrial stereo sample does not lie in ../shared/data")
 BOARD = boards.Board(9, 6, 0.025)
 SIZE = (640, 480)
 K = np.array([[620.0, 0, 322], [0, 622, 238], [0, 0, 1]])
@@ -89,36 +93,68 @@ def test_recovers_the_planted_rig(shots: Path, tmp_path: Path, monkeypatch: pyte
     assert np.degrees(turn) < 0.05
 
 
-@pytest.mark.skipif(not SAMPLES.is_dir(), reason="OpenCV's stereo samples are not here")
+@needs_samples
 def test_opencv_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, *arguments(SAMPLES, tmp_path / "rig.json", "left*.jpg", "right*.jpg")) == 0
-    shown = capsys.readouterr().out
-    assert "not used: left.jpg: no number in its name" in shown
+    assert run(monkeypatch, *arguments(SAMPLES, tmp_path / "rig.json", "left*.jpg", "right*.jpg"), "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["views"] == 13
+    assert told["rms_px"] <= 0.22
+    assert told["row_error_px"] <= 0.13
+    assert told["baseline_squares"] == pytest.approx(3.33, abs=0.02)
+    assert told["unused"] == {"left.jpg": "no number in its name", "right.jpg": "no number in its name"}
     quality = rig.load(tmp_path / "rig.json")[0].quality
     assert quality is not None
     assert len(quality.per_view_px) == 13
-    assert quality.rms_px <= 0.22
-    assert quality.row_error_px <= 0.13
-    T = rig.load(tmp_path / "rig.json")[0].cameras[1].T_camera_rig
-    assert np.linalg.norm(T[:3, 3]) / 0.025 == pytest.approx(3.33, abs=0.02)
+    assert (quality.rms_px, quality.row_error_px) == (told["rms_px"], told["row_error_px"])
 
 
-@pytest.mark.skipif(not TITANIA.is_dir(), reason="the industrial stereo sample is not here")
-def test_board_that_looks_the_same_upside_down() -> None:
-    board = boards.parse("chessboard:10x6:0.025")
-    pairs, alone = views.match(str(TITANIA / "*_l.png"), str(TITANIA / "*_r.png"))
-    assert alone == {}
-    solution = solve.solve(views.detect(pairs, board), board, "2026-01-01")
-    assert len(solution.per_view_px) == 13
-    assert solution.quality.rms_px <= 0.07
+@needs_titania
+def test_a_verged_industrial_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    # 10x6 corners look the same upside down
+    assert run(monkeypatch, *arguments(TITANIA, tmp_path / "rig.json", "*_l.png", "*_r.png", "chessboard:10x6:0.025"),
+               "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["views"] == 13
+    assert told["rms_px"] <= 0.07
+    assert told["unused"] == {}
+
+
+@needs_samples
+def test_a_spoiled_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """One partner swapped, one board shifted, one view blurred, four views mirrored, at once, by files."""
+    images = {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")
+              for path in SAMPLES.glob(f"{side}??.jpg")}
+    spoiled = images | {"right04.jpg": images["right08.jpg"], "left06.jpg": cv2.GaussianBlur(images["left06.jpg"], None, 2),
+                        "right12.jpg": cv2.warpAffine(images["right12.jpg"], np.array([[1.0, 0, 3], [0, 1, 0]]), None)}
+    spoiled |= {f"{side}{view}.jpg": np.ascontiguousarray(images[f"{side}{view}.jpg"][:, ::-1])
+                for side in ("left", "right") for view in ("01", "02", "03", "13")}
+    for name, image in spoiled.items():
+        cv2.imwrite(str(tmp_path / name.replace("jpg", "png")), image)
+    assert run(monkeypatch, *arguments(tmp_path, tmp_path / "rig.json"), "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {files: why.split(":")[0] for files, why in told["unused"].items()} == {
+        "left06.png": "blurred", "left04.png, right04.png": "wrong partner",
+        "left12.png, right12.png": "the board moved between the two images",
+        **{f"left{view}.png, right{view}.png": "both images of this view are mirrored" for view in ("01", "02", "03", "13")}}
+    assert told["baseline_squares"] == pytest.approx(3.327, rel=0.02)
+    assert told["focal_px"]["left"] == pytest.approx([533.6, 533.6], rel=0.02)
+
+
+def test_people_read_a_table(shots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                             capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "left.png").touch()
+    assert run(monkeypatch, *arguments(shots, tmp_path / "rig.json", left="[Ll]eft0*.png")) == 0
+    shown = capsys.readouterr().out
+    assert "focal length left" in shown
+    assert f"Written: {tmp_path / 'rig.json'}" in "".join(shown.splitlines())
 
 
 def test_a_turned_image_numbers_the_same_printed_corner(shots: Path) -> None:
     image = cv2.imread(str(shots / "Left02.png"), cv2.IMREAD_GRAYSCALE)
-    upright, turned = boards.find(image, BOARD), boards.find(np.ascontiguousarray(image[::-1, ::-1]), BOARD)
-    assert upright is not None
-    assert turned is not None
-    assert turned == pytest.approx(np.array(SIZE) - 1 - upright, abs=0.05)
+    upright, turned = sight.find(image, BOARD), sight.find(np.ascontiguousarray(image[::-1, ::-1]), BOARD)
+    assert isinstance(upright, Detection)
+    assert isinstance(turned, Detection)
+    assert turned.corners_px == pytest.approx(np.array(SIZE) - 1 - upright.corners_px, abs=0.05)
 
 
 @pytest.mark.parametrize(("spec", "said"), [

@@ -10,7 +10,9 @@ import pytest
 
 from binpick.errors import InputError
 from binpick.rig import Rig
-from binpick_calib import board as boards
+from binpick.rigcheck import board as boards
+from binpick.rigcheck import sight
+from binpick.rigcheck.detection import Detection
 from binpick_calib import solve, views
 
 DATA = Path(__file__).parents[2] / "../shared/data"
@@ -32,11 +34,11 @@ class Clean:
         """The views with some of the images replaced, looked at anew."""
         anew = list(self.seen.used)
         for place, pair in changes.items():
-            found = [boards.find(image, self.board) for image in pair]
-            assert found[0] is not None
-            assert found[1] is not None
-            anew[place] = replace(anew[place], corners_px=(found[0], boards.align(found[0], found[1])),
-                                  edge_px=tuple(boards.edge_px(i, f, self.board) for i, f in zip(pair, found, strict=True)))
+            found = [sight.find(image, self.board) for image in pair]
+            numbered = sight.align(found[0], found[1])
+            assert isinstance(numbered, Detection)
+            shot = views.Shot(anew[place].number, tuple(Path(name) for name in anew[place].names))
+            anew[place] = views.view(shot, self.board, (found[0], numbered))
         kept, rejected = views.screen(anew)
         return views.Views(self.seen.image_size_px, kept, rejected)
 
@@ -105,11 +107,10 @@ def test_sides_given_the_wrong_way_round(clean: Clean) -> None:
 
 
 def test_every_partner_wrong_is_refused(clean: Clean) -> None:
-    used = clean.seen.used
-    mixed = [replace(view, corners_px=(view.corners_px[0], boards.align(view.corners_px[0], other.corners_px[1])))
-             for view, other in zip(used, used[1:] + used[:1], strict=True)]
+    lefts, rights = zip(*clean.images, strict=True)
+    mixed = {place: (left, right) for place, (left, right) in enumerate(zip(lefts, rights[1:] + rights[:1], strict=True))}
     with pytest.raises(InputError, match=r"no consistent solution: only .* disagree: .*wrong partner"):
-        solve.solve(replace(clean.seen, used=tuple(mixed)), clean.board, "2026-01-01")
+        solve.solve(clean.spoiled(mixed), clean.board, "2026-01-01")
 
 
 def test_a_camera_bumped_half_way_is_refused(clean: Clean) -> None:

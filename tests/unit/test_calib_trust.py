@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from binpick import geometry, rig
 from binpick.errors import InputError
-from binpick_calib import board as boards
-from binpick_calib import lens, plausible, solve, views
+from binpick.rigcheck import board as boards
+from binpick_calib import bundle, lens, plausible, solve, views
 
 BOARD = boards.Board(9, 6, 0.025)
 SIZE = (640, 480)
@@ -79,6 +79,38 @@ def test_deviations_are_told_and_hold() -> None:
     assert "left.k3" not in sigma
 
 
+def shared_error(all_views: views.Views, amount_px: float, random: np.random.Generator) -> views.Views:
+    """With what the corners of an image have wrong in common: a smooth bend, another one in each image."""
+    x, y = (BOARD.points_m[:, :2] / np.ptp(BOARD.points_m[:, :2], axis=0) - 0.5).T
+    bend = np.column_stack([np.ones(54), x, y, x * x, y * y, x * y])
+    return replace(all_views, used=tuple(replace(v, corners_px=tuple(
+        (px + bend @ random.normal(0, amount_px, (6, 2))).astype(np.float32) for px in v.corners_px)) for v in all_views.used))
+
+
+@pytest.mark.parametrize("amount_px", [0.0, 0.1])
+def test_the_truth_lies_within_the_deviations_as_often_as_it_should(amount_px: float) -> None:
+    truth = bundle.Lens(np.array([620, 620, 322, 238, *BARREL, *np.zeros(6)]))
+    along = T_RIGHT[:3, 3] / np.linalg.norm(T_RIGHT[:3, 3])
+    directions = np.zeros((8, 30))
+    directions[range(7), [0, 2, 3, 4, 12, 14, 16]] = 1      # fx, cx, cy and k1 of the left, fx, cx, k1 of the right lens
+    directions[7, 27:] = along                                # and the baseline
+    planted = directions @ np.concatenate([truth.values, truth.values, bundle.pose(T_RIGHT)])
+    off, by_corners = [], []
+    for seed in range(30):
+        drawn = shared_error(seen(number=10, seed=100 + seed), amount_px, np.random.default_rng(seed))
+        corners = [solve.seen_by(v, camera, BOARD) for v in drawn.used for camera in (0, 1)]
+        places = {s.view: bundle.place(truth, s) for s in corners if s.camera == 0}
+        fitted = bundle.adjust(corners, (truth, truth), (np.eye(4), T_RIGHT), places, (0, 1))
+        assert fitted.covariance is not None
+        found = directions @ np.concatenate([*(own.values for own in fitted.lenses), bundle.pose(fitted.T_cam_rig[1])])
+        off.append((found - planted) / fitted.covariance.deviations(directions))
+        by_corners.append((found - planted) / np.sqrt(np.diag(directions @ fitted.covariance.scatter @ directions.T)))
+    assert 0.6 < np.mean(np.abs(off) < 1) < 0.85
+    assert np.mean(np.abs(off) < 2) > 0.92
+    # corners taken for witnesses of their own promise too much as soon as they err together
+    assert (np.mean(np.abs(by_corners) < 2) > 0.9) == (amount_px == 0)
+
+
 def test_three_cameras_one_of_them_not_always_there() -> None:
     all_views = seen(steps=(np.eye(4), T_RIGHT, T_THIRD))
     unseen = np.full_like(BOARD.points_m[:, :2], np.nan)
@@ -134,6 +166,14 @@ def test_absurd_distortion() -> None:
     assert any("left: k3 = 25 moves the corner of the image" in fault for fault in plausible.faults(absurd))
     assert lens.folds(K, np.array([-1.5, 0, 0, 0, 0.0]), SIZE)
     assert not lens.folds(K, np.array([-0.28, 0.09, 0, 0, 0.0]), SIZE)
+
+
+def test_a_first_guess_does_not_run_away() -> None:
+    # the board's vanishing points say 11420 px for the right lens of this set
+    all_views = seen(number=10, noise_px=0.15, tilt_deg=20, seed=1014)
+    solution = solve.solve(all_views, BOARD, "2026-01-01")
+    assert solution.quality.rejected == {}
+    assert [camera.K[0][0] for camera in solution.rig.cameras] == pytest.approx([620, 620], rel=0.02)
 
 
 def test_same_views_same_bytes() -> None:
