@@ -1,4 +1,4 @@
-"""Every test: no leaked threads, free ports, a time limit, and a clock that does not blame it for the machine."""
+"""Every test: no leaked threads, free ports, a time limit, a clock that does not blame it for the machine; a board to show."""
 
 import faulthandler
 import mmap
@@ -11,9 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 LIMIT_S = 60
 SLOW_LIMIT_S = 300
@@ -88,3 +92,51 @@ def gige_addresses() -> tuple[str, str]:
 
     left, right = free()
     return left, right
+
+
+@dataclass(frozen=True)
+class ShownBoard:
+    """A rig, and what it sees while somebody shows it a board at one place after the other, until that is enough."""
+
+    spec: str
+    size: tuple[int, int]
+    K: np.ndarray
+    T_right_left: np.ndarray
+    pairs: list[tuple[np.ndarray, np.ndarray]]
+
+
+SHOWN_AT = [(x, y, z, tilt) for (x, y, z), tilt in zip(
+    [(0.04, 0.0, 0.55), (-0.05, -0.09, 0.52), (0.14, -0.09, 0.54), (-0.06, 0.10, 0.5), (0.15, 0.10, 0.5), (0.04, -0.10, 0.48),
+     (0.04, 0.10, 0.48), (-0.05, 0.0, 0.5), (0.14, 0.0, 0.5), (0.04, 0.0, 0.40), (0.04, 0.02, 0.7), (0.0, 0.0, 0.6),
+     (0.08, 0.02, 0.58), (0.02, -0.03, 0.52), (0.06, 0.03, 0.62)],
+    [(0, 0), (25, 0), (-25, 0), (0, 25), (0, -25), (28, 5), (-28, 5), (5, 28), (5, -28), (0, 0), (5, 5), (20, 20), (-20, 20),
+     (20, -20), (-20, -20)], strict=True)]
+"""Middle of the board, metres, and its turns about x and y, degrees."""
+
+
+@pytest.fixture(scope="session")
+def shown_board() -> ShownBoard:
+    """Drawn twice oversampled; the board lies on its frame's z = 0."""
+    columns, rows, square_m, side, size = 9, 6, 0.025, 40, (640, 480)
+    K = np.array([[620.0, 0, 322], [0, 622, 238], [0, 0, 1]])
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3] = Rotation.from_euler("xyz", [0.4, -1, 0.8], degrees=True).as_matrix()
+    T_right_left[:3, 3] = [-0.08, 0.001, 0.002]
+    cells = np.add.outer(np.arange(-1, rows), np.arange(-1, columns)) % 2
+    sheet = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
+                               cv2.BORDER_CONSTANT, value=210)
+    metres = square_m / side
+    T_board_sheet = np.array([[metres, 0, (0.5 - 2 * side) * metres], [0, metres, (0.5 - 2 * side) * metres], [0, 0, 1]])
+
+    def draw(T_camera_board: np.ndarray) -> np.ndarray:
+        H = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]) @ K @ T_camera_board[:3, [0, 1, 3]] @ T_board_sheet
+        large = cv2.warpPerspective(sheet, H, (size[0] * 2, size[1] * 2), flags=cv2.INTER_AREA, borderValue=120)
+        return cv2.resize(cv2.GaussianBlur(large, None, 1.5), size, interpolation=cv2.INTER_AREA)
+
+    pairs = []
+    for x, y, z, tilt in SHOWN_AT:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xy", tilt, degrees=True).as_matrix()
+        T[:3, 3] = [x, y, z] - T[:3, :3] @ [square_m * (columns - 1) / 2, square_m * (rows - 1) / 2, 0]
+        pairs.append((draw(T), draw(T_right_left @ T)))
+    return ShownBoard(f"chessboard:{columns}x{rows}:{square_m}", size, K, T_right_left, pairs)

@@ -6,23 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from binpick import rig as rigs
 from binpick.errors import BinpickError, InputError
 from binpick.poses import PoseFormat
 from binpick.rigcheck.board import Board, parse
-from binpick_calib import loose, residuals, vector
+from binpick_calib import loose, residuals, summary, vector
 from binpick_calib import sheet as sheets
 from binpick_calib import views as viewing
 from binpick_calib.report import page
-from binpick_calib.solve import Solution
 from binpick_calib.solve import solve as solve_views
 from binpick_calib.views import Shot
 
@@ -32,6 +30,42 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 @app.callback()
 def tool() -> None:
     """Make the rig file that binpick runs on."""
+
+
+@app.command("board")
+def print_board(
+    board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as solve is told it: chessboard:9x6:0.025, "
+                                                            "charuco:9x6:0.025, circles:9x7:0.02, acircles:4x11:0.02.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The file to write: .pdf or .svg.")],
+    page: Annotated[str, typer.Option(metavar="SIZE", help=f"{', '.join(sheets.PAGES_MM)}, or width and height in mm: "
+                                                           "600x400.")] = "a4",
+) -> None:
+    """Write a board to print at true scale, with a ruler of 100 mm to check the print by."""
+    if out.suffix.lower() not in (".pdf", ".svg"):
+        raise InputError(f"--out {out}: write a .pdf or an .svg file")
+    sheet = sheets.layout(parse(board), page)
+    _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
+    typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
+
+
+@app.command()
+def capture(
+    board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as for solve: charuco:9x6:0.025.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the views; one that holds some is gone on with.")],
+    cell: Annotated[Path | None, typer.Option(metavar="FILE", help="Cell file: its cameras, or its daemon if it runs.")] = None,
+    url: Annotated[str, typer.Option(help="A running daemon: http://127.0.0.1:8080.")] = "",
+    left: Annotated[str, typer.Option(metavar="GLOB", help="Left images of a folder that fills up, quoted.")] = "",
+    right: Annotated[str, typer.Option(metavar="GLOB", help="Right images of that folder.")] = "",
+    views: Annotated[int, typer.Option(min=5, max=200, help="How many views there shall be at least.")] = 12,
+) -> None:
+    """Take views of a board by itself while you move it, and say what is missing.
+
+    A view is taken as soon as the board stands still, is sharp, and shows something new: a part of
+    the images, a tilt, a distance. It ends when the set is enough, or at Ctrl-C; what was taken stays.
+    """
+    from binpick_calib import session
+
+    session.run(board, out, views, cell, url, left, right)
 
 
 @app.command()
@@ -65,9 +99,9 @@ def solve(
         page.write(report, page.of(solution.rig, fit, spec, shots))
     unused = alone | solution.quality.rejected
     if as_json:
-        typer.echo(json.dumps(figures(solution, spec) | {"unused": unused, "out": str(out)}))
+        typer.echo(json.dumps(summary.figures(solution, spec) | {"unused": unused, "out": str(out)}))
     else:
-        show(Console(), solution, spec, unused)
+        summary.show(Console(), solution, spec, unused)
         typer.echo(f"Written: {out}" + (f", {report}" if report else ""))
 
 
@@ -195,20 +229,32 @@ def carrier(
         typer.echo(f"Written: {out}")
 
 
-@app.command("board")
-def print_board(
-    board: Annotated[str, typer.Option(metavar="SPEC", help="The board, as solve is told it: chessboard:9x6:0.025, "
-                                                            "charuco:9x6:0.025, circles:9x7:0.02, acircles:4x11:0.02.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The file to write: .pdf or .svg.")],
-    page: Annotated[str, typer.Option(metavar="SIZE", help=f"{', '.join(sheets.PAGES_MM)}, or width and height in mm: "
-                                                           "600x400.")] = "a4",
+@app.command()
+def verify(
+    rig: Annotated[Path, typer.Option(metavar="FILE", help="The rig file; the trend is kept beside it.")],
+    left: Annotated[Path | None, typer.Option(metavar="FILE", help="An image of the left camera.")] = None,
+    right: Annotated[Path | None, typer.Option(metavar="FILE", help="The right camera's of the same moment.")] = None,
+    url: Annotated[str, typer.Option(help="Instead of images: a running daemon, which takes them.")] = "",
+    board: Annotated[str, typer.Option(metavar="SPEC", help="A board in view, as for solve.")] = "",
+    sphere: Annotated[float, typer.Option(metavar="M", help="A sphere in view: its radius, metres.")] = 0.0,
+    flat: Annotated[bool, typer.Option("--flat", help="A flat in view.")] = False,
+    stays: Annotated[bool, typer.Option("--stays", help="The board stands where it stood when first verified so.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
-    """Write a board to print at true scale, with a ruler of 100 mm to check the print by."""
-    if out.suffix.lower() not in (".pdf", ".svg"):
-        raise InputError(f"--out {out}: write a .pdf or an .svg file")
-    sheet = sheets.layout(parse(board), page)
-    _write(out, vector.pdf(sheet) if out.suffix.lower() == ".pdf" else vector.svg(sheet))
-    typer.echo(f"Written: {out} ({sheet.width:g} x {sheet.height:g} mm; print at 100 %, then check the ruler)")
+    """Say whether a rig file still holds, by one look at a board, a sphere or a flat anywhere in view.
+
+    A board tells most: rows, scale, and with --stays whether the rig was moved. A sphere or a flat needs
+    the projected pattern or a texture. Exit code 1: it does not hold.
+    """
+    from binpick_calib import verification
+
+    gauge, at = verification.Gauge(board, sphere, flat), datetime.now(UTC).isoformat(timespec="seconds")
+    told, entries = verification.run(gauge, rig, left, right, url, stays, at)
+    if as_json:
+        typer.echo(json.dumps(told))
+    else:
+        verification.show(Console(), told, entries)
+    raise typer.Exit(int(told["level"] == "fault"))
 
 
 def _now() -> str:
@@ -220,44 +266,6 @@ def _write(out: Path, content: bytes) -> None:
         out.write_bytes(content)
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-
-
-def figures(solution: Solution, board: Board) -> dict[str, Any]:
-    """What a calibration is judged by."""
-    cameras = solution.rig.cameras
-    baseline_m = float(np.linalg.norm(cameras[1].T_camera_rig[:3, 3]))
-    return {
-        "views": len(solution.per_view_px),
-        "rms_px": solution.quality.rms_px,
-        "row_error_px": solution.quality.row_error_px,
-        "distortion_model": solution.quality.distortion_model,
-        "focal_px": {camera.name: [camera.K[0][0], camera.K[1][1]] for camera in cameras},
-        "baseline_m": baseline_m,
-        "baseline_squares": baseline_m / board.square_m,
-        "sigma": solution.quality.sigma,
-        "per_view_px": {str(number): [px if np.isfinite(px) else None for px in each]
-                        for number, each in solution.per_view_px.items()},
-    }
-
-
-def show(console: Console, solution: Solution, board: Board, unused: dict[str, str]) -> None:
-    """The figures for people: each view's residual, the whole, and what was not used."""
-    told, sigma = figures(solution, board), solution.quality.sigma or {}
-    views = Table("view", *(f"{camera.name} px" for camera in solution.rig.cameras), title="Residual of each view (rms)")
-    for number, each in solution.per_view_px.items():
-        views.add_row(str(number), *(f"{px:.3f}" if np.isfinite(px) else "-" for px in each))
-    whole = Table(show_header=False, title="Rig")
-    whole.add_row("views used", str(told["views"]))
-    whole.add_row("stereo rms", f"{told['rms_px']:.3f} px")
-    whole.add_row("row error after rectification (median)", f"{told['row_error_px']:.3f} px")
-    for side, (fx, fy) in told["focal_px"].items():
-        whole.add_row(f"focal length {side}", f"{fx:.2f}, {fy:.2f} ± {sigma[f'{side}.fx_px']:.2f} px")
-    whole.add_row("distortion", str(told["distortion_model"]))
-    whole.add_row("baseline", f"{told['baseline_m']:.5f} ± {sigma['right.distance_m']:.5f} m "
-                              f"= {told['baseline_squares']:.3f} squares")
-    console.print(views, whole)
-    for name, reason in unused.items():
-        console.print(f"not used: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
 
 
 def main() -> None:

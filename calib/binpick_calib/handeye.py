@@ -21,7 +21,7 @@ from binpick.rigcheck import board as boards
 from binpick.rigcheck import handeye, sight
 from binpick.rigcheck.board import Board
 from binpick.rigcheck.detection import Detection, Refusal
-from binpick.rigcheck.handeye import HandEye, Mounting, Sample
+from binpick.rigcheck.handeye import HandEye, Mounting, Sample, mounted
 from binpick_calib import robot
 from binpick_calib import views as viewing
 from binpick_calib.robot import Row
@@ -79,17 +79,6 @@ def _pose_format(name: str) -> PoseFormat | None:
     if name and name not in PoseFormat.__members__:
         raise InputError(f"--pose-format {name}: it is one of {', '.join(PoseFormat.__members__)}")
     return PoseFormat[name] if name else None
-
-
-def mounted(rig: Rig, found: HandEye, created: str) -> Rig:
-    """The rig with its place in the robot; a rig file without quality stays without."""
-    document = rig.model_dump() | {"created": created}
-    for name in ("T_base_rig", "T_flange_rig"):
-        T = getattr(found, name)
-        document[name] = None if T is None else T.tolist()
-    if rig.quality is not None:
-        document["quality"] |= {"hand_eye_rms_m": found.rms_m, "hand_eye_rms_rad": found.rms_rad}
-    return Rig.model_validate(document)
 
 
 def _partners(table: robot.Table, shots: Sequence[viewing.Shot]) -> tuple[dict[int, Row], dict[str, str]]:

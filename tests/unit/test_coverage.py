@@ -116,6 +116,15 @@ def test_a_useful_view_says_what_is_new() -> None:
     assert covered.useful(seen(0.05, 0.0, z=1.1)) == (True, "new: another distance")
 
 
+def test_once_there_are_enough_views_only_what_is_missing_is_taken() -> None:
+    covered = full()
+    other = seen(0.02, 0.12, 0.9, tilt_deg=(0, 12), turn_deg=30)
+    assert covered.useful(other) == (False, "nothing is missing")
+    lacking = replace(covered, views=tuple(view for view in covered.views if view[0].tilt is not Tilt.UPPER), wanted=10)
+    assert lacking.useful(other)[1].startswith("still missing: the ")
+    assert lacking.useful(seen(tilt_deg=(30, 0)))[0]
+
+
 def test_a_board_numbered_from_its_other_end_stands_still() -> None:
     even = boards.parse("chessboard:8x6:0.025")    # looks the same upside down
     now = tuple(replace(each, board=even, ids=each.ids[:48], corners_px=each.corners_px[:48]) for each in seen())

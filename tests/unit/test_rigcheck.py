@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from binpick.errors import InputError
-from binpick.rigcheck import sight
+from binpick.rigcheck import chessboard, sight
 from binpick.rigcheck.board import Board, Kind, parse
 from binpick.rigcheck.detection import Detection, Refusal, judge
 
@@ -249,3 +250,18 @@ def test_a_board_is_written_as_it_is_read(spec: str) -> None:
 def test_bad_board(spec: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         parse(spec)
+
+
+def test_a_glance_finds_what_is_there_and_says_no_at_once(shown_board: Any) -> None:
+    board = parse(shown_board.spec)
+    for image in (picture for pair in shown_board.pairs for picture in pair):
+        assert chessboard.glimpsed(cv2.resize(image, None, fx=2.5, fy=2.5), board)
+    image = shown_board.pairs[0][0]
+    glanced, found = sight.glance(image, board), sight.find(image, board)
+    assert isinstance(glanced, Detection)
+    assert isinstance(found, Detection)
+    assert (glanced.corners_px == found.corners_px).all()
+    nothing = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (1000, 1600), np.uint8), None, 9)
+    refused = sight.glance(nothing, board)
+    assert isinstance(refused, Refusal)
+    assert refused.reason.startswith("no board with 9x6 inner corners seen")

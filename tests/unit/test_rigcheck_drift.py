@@ -288,14 +288,25 @@ def test_the_verdict_goes_by_rows(off_px: float, level: Level) -> None:
     assert f"{off_px:.2f} px" in watch.sentence
 
 
-def test_a_verdict_waits_for_some_cycles_and_one_bin_does_not_make_it() -> None:
-    bad = replace(CALM, row_px=2.0, off_px=2.0)
+def test_a_warning_waits_for_some_cycles_and_one_bin_does_not_make_it() -> None:
+    bad = replace(CALM, row_px=0.9, off_px=0.9)
     assert after([bad] * 4).level is Level.OK
     assert "few" in after([bad] * 4).sentence
     assert after([*[CALM] * 8, bad, bad]).level is Level.OK
-    assert after([bad] * 5).level is Level.FAULT
-    assert after([*[CALM] * 20, *[bad] * 5]).level is Level.FAULT
+    assert after([bad] * 5).level is Level.WARN
+    assert after([*[CALM] * 20, *[bad] * 5]).level is Level.WARN
     assert after([*[bad] * 20, *[CALM] * 5]).level is Level.OK
+
+
+def test_what_is_beyond_doubt_stops_its_own_cycle() -> None:
+    bad = replace(CALM, row_px=2.0, off_px=2.0)
+    knocked = after([*[CALM] * 20, bad])
+    assert knocked.level is Level.FAULT
+    assert "in this cycle" in knocked.sentence.lower()
+    assert after([*[CALM] * 20, bad, CALM]).level is Level.OK
+    unsure = replace(CALM, row_px=1.2, off_px=1.2, sigma_px=0.05)
+    assert after([*[CALM] * 20, unsure]).level is Level.OK
+    assert after([*[CALM] * 20, *[bad] * 5]).level is Level.FAULT
 
 
 def test_vague_and_missing_readings_count_for_nothing() -> None:

@@ -22,7 +22,7 @@ RANGE = 1.25
 STILL_PX = 2.0
 """Between two frames a third of a second apart: within an exposure of 10 ms that is less than a tenth of a pixel."""
 SOFT_PX, BLURRED, FAINT = 3.0, 1.5, 25.0
-"""Blur by itself (sigma, px), blur in terms of the views' median (`solve` refuses beyond 1.7), contrast in grey levels."""
+"""Blur by itself (sigma, px), blur in terms of the views' median (`solve` refuses a little beyond), contrast in grey levels."""
 NEW_MIDDLE, NEW_SCALE, NEW_TILT_RAD, NEW_TURN_RAD = 0.12, 1.12, 0.14, 0.35
 """A view is new when the board's middle moved by this share of the image, its size by this factor, or it turned so far."""
 
@@ -201,6 +201,8 @@ class Coverage:
         alike = next((number for number, view in enumerate(self.views, start=1) if _alike(view, now)), None)
         if alike is not None:
             return False, f"like view {alike}: move, tilt or turn the board"
+        if len(self.views) >= self.wanted:      # more of the same would only make `solve` slower
+            return False, f"still missing: {self.missing[0]}" if self.missing else "nothing is missing"
         return True, "new"
 
     @property

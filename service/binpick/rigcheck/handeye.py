@@ -142,6 +142,17 @@ def solve(samples: Sequence[Sample], rig: Rig, mounting: Mounting, z_m: float | 
                    residuals, outliers)
 
 
+def mounted(rig: Rig, found: HandEye, created: str) -> Rig:
+    """The rig with its place in the robot; a rig file without quality stays without."""
+    document = rig.model_dump() | {"created": created}
+    for name in ("T_base_rig", "T_flange_rig"):
+        T = getattr(found, name)
+        document[name] = None if T is None else T.tolist()
+    if rig.quality is not None:
+        document["quality"] |= {"hand_eye_rms_m": found.rms_m, "hand_eye_rms_rad": found.rms_rad}
+    return Rig.model_validate(document)
+
+
 def _board(seen: Sequence[Sample]) -> Board:
     """The one board of enough samples."""
     if len(seen) < FEWEST:

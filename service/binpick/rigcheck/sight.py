@@ -36,6 +36,13 @@ def find(image: Image, board: Board) -> Detection | Refusal:
     return Detection(board, (image.shape[1], image.shape[0]), ids, corners, quality)
 
 
+def glance(image: Image, board: Board) -> Detection | Refusal:
+    """As `find`, for live images: quick to say no, at the price of a board now and then that is hard to see."""
+    if board.kind is Kind.CHESSBOARD and not chessboard.glimpsed(image, board):
+        return Refusal(_why_not(image, board))
+    return find(image, board)
+
+
 def _why_not(image: Image, board: Board) -> str:
     points = {Kind.CHESSBOARD: "inner corners", Kind.CHARUCO: "inner corners and its markers"}.get(board.kind, "dots")
     what = f"no board with {board.columns}x{board.rows} {points} seen"
