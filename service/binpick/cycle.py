@@ -8,10 +8,11 @@ import numpy as np
 from binpick import geometry
 from binpick.data import Depth, Image, Light, OrganisedCloud, Rectified, Segments, StereoPair
 from binpick.geometry import Transform
-from binpick.message import Metering
+from binpick.message import Metering, Verify
 from binpick.outcomes import NO_MEMORY, Attempt, Memory
 from binpick.result import Request, Result
 from binpick.rig import Rig
+from binpick.rigcheck.guard import Guard
 from binpick.settings import Job
 
 
@@ -32,6 +33,10 @@ class CycleInput:
     memory: Memory = NO_MEMORY
     """What is remembered of the bin: grasps that failed there, and what the last cycle saw."""
     metering: Metering = ""
+    guard: Guard | None = None
+    """What the watchdog starts from; None: nobody watches the calibration."""
+    verify: Verify | None = None
+    """The cycle looks at the calibration alone; None: it looks for grasps."""
 
     @property
     def lights(self) -> tuple[Light, ...]:
@@ -71,6 +76,8 @@ class CycleResult:
     memory: Memory | None = None
     """What the next cycle of this bin should start from, until outcomes are told; None: the scene was not judged."""
     T_camera_bin: Transform | None = None
+    guard: Guard | None = None
+    """What the watchdog should start the next cycle from; None: it did not look."""
     shown: Image | None = None      # the window of the left view without the pattern, where a shot was taken so
 
     @property

@@ -22,7 +22,7 @@ BinpickError
     ├── CameraLost        it answered once, and stopped          −4    503   exit 3
     └── PairRefused       two images, but not of one instant     −4    503   exit 3
 
-Bad scenes (`Code` 100 to 109) are results, never exceptions.
+Bad scenes (`Code` 100 to 110) are results, never exceptions.
 """
 
 from enum import IntEnum
@@ -45,6 +45,7 @@ class Code(IntEnum):
     BIN_UNKNOWN = 107
     ALL_UNCERTAIN = 108
     ALL_OUT_OF_REACH = 109
+    BOARD_NOT_FOUND = 110
     BAD_ARGUMENT = -1
     TIMEOUT = -3
     CAMERAS = -4
@@ -86,6 +87,7 @@ MESSAGES: dict[Code, str] = {
     Code.BIN_UNKNOWN: "Nothing was found, but too little of the floor was seen to call the bin empty.",
     Code.ALL_UNCERTAIN: "Every grasp is less certain than the recipe allows.",
     Code.ALL_OUT_OF_REACH: "Every grasp was stopped by the last gate: out of reach, tilted too far, or not sound.",
+    Code.BOARD_NOT_FOUND: "The board was not seen by every camera: the sample says by which, and why not.",
     Code.BAD_ARGUMENT: "An argument is missing or out of range.",
     Code.TIMEOUT: "The cycle did not end within its time limit.",
     Code.CAMERAS: "The cameras delivered no usable pair.",

@@ -3,18 +3,23 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from binpick.errors import Code
 from binpick.result import Snapshot
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """`live`: restarting the daemon would not help; `ready`: a cycle would start now, or runs. `reasons` is empty when ok."""
+    """`live`: restarting the daemon would not help; `ready`: a cycle would start now, or runs. `reasons` is empty when ok.
+
+    `unseen`: what no check of the calibration in this cell would notice; no reason to worry, but to know.
+    """
 
     status: Literal["ok", "degraded", "fault"]
     live: bool
     ready: bool
     reasons: tuple[str, ...]
+    unseen: tuple[str, ...] = ()
+    rig: str = ""
+    """The version of the rig that the cell runs on."""
 
 
 def judge(snapshot: Snapshot, *, alive: bool = True, recording: str = "") -> Health:
@@ -25,12 +30,21 @@ def judge(snapshot: Snapshot, *, alive: bool = True, recording: str = "") -> Hea
     faults = [] if alive else ["the cell's thread has died: restart the daemon and report the log"]
     faults += [f"camera {camera.name} is down: {camera.error}" for camera in snapshot.cameras
                if not camera.connected and camera.error]
-    attention = [*_waiting(snapshot, bool(faults)), *snapshot.faults, *_calibration(snapshot)]
+    waiting = _waiting(snapshot, bool(faults))
+    known = snapshot.drift
+    drifted = known is not None and known.level == "fault"
+    if known is not None and drifted:
+        faults += known.attention
+    attention = [*waiting, *snapshot.faults, *(known.attention if known is not None and not drifted else ())]
+    if snapshot.rig_note:
+        attention.append(f"rig: {snapshot.rig_note}")
     if recording:
         attention.append(f"recording: {recording}")
     return Health(
         status="fault" if faults else "degraded" if attention else "ok", live=alive,
-        ready=alive and snapshot.phase in ("ready", "acquiring", "computing"), reasons=(*faults, *attention))
+        ready=alive and snapshot.phase in ("ready", "acquiring", "computing"), reasons=(*faults, *attention),
+        unseen=known.unseen if known is not None else (),
+        rig=f"version {snapshot.rig.version}, sha256 {snapshot.rig.sha256}" if snapshot.rig is not None else "")
 
 
 def _waiting(snapshot: Snapshot, faulted: bool) -> list[str]:
@@ -42,9 +56,3 @@ def _waiting(snapshot: Snapshot, faulted: bool) -> list[str]:
     if all(camera.connected for camera in snapshot.cameras) and snapshot.cameras:
         return ["a withdrawn cycle is still being cleared away"]
     return ["the cameras are being opened"]
-
-
-def _calibration(snapshot: Snapshot) -> list[str]:
-    latest = snapshot.latest
-    warned = latest is not None and latest.result.return_code.code in (Code.CALIBRATION_WARNING, Code.CALIBRATION_FAULT)
-    return [latest.result.return_code.message] if warned and latest is not None else []

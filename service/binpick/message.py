@@ -1,13 +1,14 @@
 """What the parts of a result share, and its bin: frozen messages, metres and radians, unknown keys and NaN refused."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Triple = tuple[float, float, float]
 Xyzw = tuple[float, float, float, float]
 Metering = Literal["", "settled", "too_dark", "too_bright", "unsteady"]
+Level = Literal["ok", "warn", "fault"]
 
 
 class Wire(BaseModel):
@@ -97,6 +98,86 @@ class SyncMessage(Wire):
     arrival_ms: float = 0.0
     metering: Metering = ""
     shots: tuple[ShotMessage, ...] = ()
+
+
+class MarksMessage(Wire):
+    """What the reference marks say of the rig; null, with a reason, where too few were seen.
+
+    `shift_m` and `turn_rad`: of the cameras against the cell since the marks were stored; pitch, yaw, roll: of the second
+    camera against the first since the calibration; `depth_m`: what that does to depth in the marks' middle.
+    """
+
+    seen: int
+    """Marks that both cameras saw."""
+    missing: tuple[int, ...] = ()
+    """Numbers of those that not both saw."""
+    reason: str = ""
+    shift_m: float | None
+    turn_rad: float | None
+    pitch_rad: float | None
+    yaw_rad: float | None
+    roll_rad: float | None
+    depth_m: float | None
+
+
+class CorrectionMessage(Wire):
+    """The rig file's calibration was corrected for this cycle."""
+
+    rotation_rad: Triple
+    """Pitch, yaw and roll of the second camera, about x, y and z of the rectified view."""
+    rig_sha256: str
+    """The rig as it was used; `inputs` names the file's."""
+    number: int = 1
+    """How many turns the sum is of."""
+
+
+class BoardMessage(Wire):
+    """A calibration board that was in view of a verification."""
+
+    board: str
+    points: int
+    """Of the board, seen by both cameras."""
+    level: Level
+    sentence: str
+    row_px: float | None
+    scale_permille: float | None
+    """Lengths on the board as seen, too long by so much."""
+    planarity_m: float | None
+    """Rms distance of its points from a plane."""
+
+
+class CalibrationMessage(Wire):
+    """How well the rig file still describes the cameras; null where too little was seen to say."""
+
+    level: Level
+    """warn: poses exist, with return code 2; fault: none do, return code -24."""
+    sentence: str
+    """What was measured, and what to do."""
+    reason: str = ""
+    """Why this cycle's rows are not told."""
+    row_px: float | None
+    """Rows of the right image below those of the left, median, px."""
+    row_sigma_px: float | None
+    points: int
+    """Places that the row error rests on."""
+    off_px: float | None
+    """What counts for the limits: rows over the whole view and the last cycles, px."""
+    change_px: float | None
+    """Change of the row error over 100 cycles, px."""
+    bin_m: float | None = None
+    """How much higher than expected a located bin seems to stand, over the last cycles."""
+    marks: MarksMessage | None = None
+    correction: CorrectionMessage | None = None
+    board: BoardMessage | None = None
+
+
+class Verify(Wire):
+    """What a verification of the calibration is to do beside looking at rows and reference marks."""
+
+    store_marks: bool = False
+    """Store where the reference marks are seen now: at commissioning, with a calibration that is trusted."""
+    board: Annotated[str, Field(max_length=64)] = ""
+    """A calibration board in view of both cameras, as for `binpick-calib` (charuco:9x6:0.025); "": none."""
 
 
 class RecipeMessage(Wire):

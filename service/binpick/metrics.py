@@ -1,7 +1,7 @@
 """What Prometheus reads: finished cycles and their stage times are counted here, all else is asked for at each scrape."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, exposition
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -10,6 +10,18 @@ from prometheus_client.registry import Collector
 MEDIA_TYPE = exposition.CONTENT_TYPE_LATEST
 BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 """From one array operation to the longest usual time limit; finest around the 0.3 s a cycle may compute."""
+
+CALIBRATION = {
+    "level": "What the watchdog says of the calibration: 0 ok, 1 warning, 2 fault.",
+    "row_px": "Rows of the right image below the left's in the last cycle, px.",
+    "off_px": "What counts for the watchdog's limits: rows over the whole view and the last cycles, px.",
+    "change_px": "Change of the row error over 100 cycles, px.",
+    "marks_seen": "Reference marks that both cameras saw.",
+    "marks_shift_m": "Cameras against the cell since the reference marks were stored, m.",
+    "marks_turn_rad": "Cameras against the cell since the reference marks were stored, rad.",
+    "depth_error_m": "What the reference marks say depth is off, m.",
+    "correction_rad": "Turn by which the second camera is corrected, rad.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +35,8 @@ class Facts:
     frame_age_s: float
     ready: bool
     pairs_refused: int = 0
+    calibration: Mapping[str, float] = field(default_factory=dict)
+    """The watchdog's figures, by the names of CALIBRATION; unknown ones are absent."""
 
 
 class Metrics:
@@ -65,6 +79,9 @@ class _Scrape(Collector):
         yield CounterMetricFamily("binpick_pairs_refused", "Pairs refused: of no one instant, not whole, or not proved.",
                                   facts.pairs_refused)
         yield GaugeMetricFamily("binpick_frame_age_seconds", "Since the last trigger that gave a pair.", facts.frame_age_s)
+        for name, sentence in CALIBRATION.items():
+            if name in facts.calibration:
+                yield GaugeMetricFamily(f"binpick_calibration_{name}", sentence, facts.calibration[name])
         yield GaugeMetricFamily("binpick_ready", "1 when a cycle would start now.", int(facts.ready))
 
     def describe(self) -> list[Metric]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float32
 
-from binpick import geometry
+from binpick import geometry, watchdog
 from binpick.answer import answer, code_of, part_messages, publishable
 from binpick.cycle import CycleInput, CycleResult
 from binpick.data import Depth, Grasp, HeightMap, Image, Light, OrganisedCloud, PartPose, Rectified, Segments
@@ -85,10 +85,8 @@ def poses(inputs: CycleInput, cycle: CycleResult, proceed: Proceed = lambda: Non
     with clock.stage("pose"):
         ranked = (grasp.part_id for grasp in cycle.result.grasps)
         parts = _located(inputs, cycle.T_camera_bin, cycle.rectified, segments, ranked, proceed)
-    was, spent = cycle.result.timing_ms, clock.spent()
-    times = {**was, **spent, "compute": round(was["compute"] + spent["compute"], 3)}
     messages = part_messages(parts, inputs, frames)
-    return replace(cycle, result=cycle.result.model_copy(update={"parts": messages, "timing_ms": times}))
+    return _later(replace(cycle, result=cycle.result.model_copy(update={"parts": messages})), clock)
 
 
 def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
@@ -97,14 +95,37 @@ def grasps(inputs: CycleInput, proceed: Proceed = lambda: None) -> CycleResult:
     clock = _Clock(proceed)
     frames = Frames.of(inputs)
     with clock.stage("rectify"):
-        rect = rectify.rectification(inputs.rig)
+        rig = watchdog.rig(inputs)
+        rect = rectify.rectification(rig)
         box = load_carrier.search_box(inputs.job.bin, inputs.job.recipe.limits.above_rim_m)
-        view = rectify.visible(rect, inputs.rig, rectify.window(rect, frames.T_camera_bin, *box))
-        shots = tuple(rectify.rectify(pair.left.image, pair.right.image, inputs.rig, view) for pair in inputs.pairs)
-    with clock.stage("match"):
-        rectified, depth = stereo.of_shots(shots, inputs.lights, inputs.job.recipe.stereo)
-    cycle = _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
-    return replace(cycle, shown=_shown(shots, inputs.lights))
+        view = rectify.visible(rect, rig, rectify.window(rect, frames.T_camera_bin, *box))
+        shots = tuple(rectify.rectify(pair.left.image, pair.right.image, rig, view) for pair in inputs.pairs)
+    with ThreadPoolExecutor(1, thread_name_prefix="binpick-watchdog") as beside:
+        looking = beside.submit(watchdog.look, inputs, rig, shots[0])
+        if inputs.verify is not None:
+            return _watched(inputs, rig, CycleResult(answer(inputs, frames, clock.spent(), Code.OK)), looking, proceed)
+        with clock.stage("match"):
+            rectified, depth = stereo.of_shots(shots, inputs.lights, inputs.job.recipe.stereo)
+        cycle = _scene(inputs, frames, clock, rectified, depth, partial(cloud.reproject, depth, rectified))
+        return _watched(inputs, rig, replace(cycle, shown=_shown(shots, inputs.lights)), looking, proceed)
+
+
+def _watched(inputs: CycleInput, rig: Rig, cycle: CycleResult, looking: Future[watchdog.Look | None], proceed: Proceed,
+             ) -> CycleResult:
+    """The cycle after the watchdog's word, which has long been found when the grasps are."""
+    if inputs.guard is None:
+        return cycle
+    clock = _Clock(proceed)
+    with clock.stage("calibration"):
+        cycle = watchdog.judged(inputs, rig, cycle, looking.result())
+    return _later(cycle, clock)
+
+
+def _later(cycle: CycleResult, clock: "_Clock") -> CycleResult:
+    """With the times of stages that came after its answer."""
+    was, spent = cycle.result.timing_ms, clock.spent()
+    times = {**was, **spent, "compute": round(was["compute"] + spent["compute"], 3)}
+    return replace(cycle, result=cycle.result.model_copy(update={"timing_ms": times}))
 
 
 def _shown(shots: tuple[Rectified, ...], lights: tuple[Light, ...]) -> Image | None:

@@ -2,7 +2,7 @@
 
     left.png right.png         the raw images, lossless          rig.json   the rig as applied
     left-02.png right-02.png   of the second shot, and so on     job.json   recipe, bin and tool as applied
-    input.json                 cycle, request, memory of outcomes before the cycle, facts per frame
+    input.json                 cycle, request, memory of outcomes and drift before the cycle, facts per frame
     result.json                the answer as it was published
 """
 
@@ -26,9 +26,10 @@ from binpick import __version__, rig
 from binpick.cycle import CycleInput
 from binpick.data import Frame, Image, StereoPair, frozen
 from binpick.errors import ImageError, InputError
-from binpick.message import Metering, Wire
+from binpick.message import Metering, Verify, Wire
 from binpick.outcomes import NO_MEMORY, Memory
 from binpick.result import Request, Result
+from binpick.rigcheck.guard import Guard
 from binpick.settings import Job
 
 QUEUE = 2
@@ -81,6 +82,10 @@ class InputFile(PairFacts):
     """What was remembered of the bin before the cycle."""
     metering: Metering = ""
     """What auto exposure came to."""
+    guard: Guard | None = None
+    """What the watchdog knew before the cycle: correction, reference marks, earlier cycles."""
+    verify: Verify | None = None
+    """The cycle looked at the calibration alone."""
 
 
 def folder_name(inputs: CycleInput) -> str:
@@ -119,7 +124,7 @@ def load(folder: Path) -> tuple[CycleInput, Result]:
                          f"job.json has {len(job.recipe.lights)}")
     pair, *more = (_pair(folder, number, shot) for number, shot in enumerate((facts, *facts.more), start=1))
     inputs = CycleInput(facts.cycle_id, pair, used_rig, job, facts.request, facts.simulated, tuple(more),
-                        facts.memory, facts.metering)
+                        facts.memory, facts.metering, facts.guard, facts.verify)
     return inputs, _parse(folder / "result.json", Result)
 
 
@@ -127,8 +132,10 @@ def _files(inputs: CycleInput, result: Result) -> dict[str, bytes]:
     facts = InputFile(
         made_with={"binpick": __version__, "opencv": cv2.__version__, "numpy": np.__version__, "machine": platform.machine()},
         cycle_id=inputs.cycle_id, request=inputs.request, simulated=inputs.simulated, **dict(_pair_facts(inputs.pair)),
-        more=tuple(map(_pair_facts, inputs.more)), memory=inputs.memory, metering=inputs.metering)
-    absent = {name for name in ("more", "memory", "metering") if getattr(inputs, name) in ((), NO_MEMORY, "")}
+        more=tuple(map(_pair_facts, inputs.more)), memory=inputs.memory, metering=inputs.metering,
+        guard=inputs.guard, verify=inputs.verify)
+    absent = {name for name in ("more", "memory", "metering", "guard", "verify")
+              if getattr(inputs, name) in ((), NO_MEMORY, "", None)}
     images = {_name(side, number): _png(frame.image) for number, pair in enumerate(inputs.pairs, start=1)
               for side, frame in (("left", pair.left), ("right", pair.right))}
     return images | {

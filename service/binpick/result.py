@@ -8,9 +8,10 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
+from binpick.calibration import RigVersion, SampleAnswer
 from binpick.data import CameraStatus
 from binpick.errors import Code
-from binpick.message import BinMessage, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
+from binpick.message import BinMessage, CalibrationMessage, Level, PoseMessage, RecipeMessage, SyncMessage, Triple, Wire, Xyzw
 from binpick.outcomes import Attempt
 
 FrameName = Literal["camera", "bin", "base"]
@@ -157,6 +158,8 @@ class Result(Wire):
     """With a mesh: parts in the order of their grasps. They say where a part lies; only `grasps` are to be moved by."""
     funnel: Funnel | None = None
     sync: SyncMessage | None = None
+    calibration: CalibrationMessage | None = None
+    """What the watchdog says of the rig's calibration; null when it did not look."""
     timing_ms: dict[str, float] = Field(default_factory=dict)
     inputs: Inputs | None = None
 
@@ -198,6 +201,8 @@ class Published:
     triggered_ns: int
     attempts: tuple[Attempt, ...] = ()
     """Its grasps as they will be remembered when their outcomes are told."""
+    sample: SampleAnswer | None = None
+    """What came of it when it was a calibration sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +211,26 @@ class Artefact:
 
     media_type: str
     body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What the watchdog knows of the rig's calibration, over all cycles.
+
+    `latest` is its last word; `row_px` the row error of the last cycles that could tell, the newest last, of which cycles
+    `cycle_ids` says; the limits are the cell file's. `attention` are sentences for whoever looks after the cell, `unseen` what
+    no figure here would show.
+    """
+
+    level: Level = "ok"
+    latest: CalibrationMessage | None = None
+    row_px: tuple[float, ...] = ()
+    cycle_ids: tuple[int, ...] = ()
+    warn_px: float = 0.3
+    fault_px: float = 1.0
+    marks: Literal["none", "to be stored", "stored"] = "none"
+    attention: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,3 +254,14 @@ class Snapshot:
     owner: Owner = "none"
     simulated: bool = False
     counts: tuple[tuple[str, int], ...] = ()
+    drift: Drift | None = None
+    """What is known of the calibration's; None: nobody watches it."""
+    rig: RigVersion | None = None
+    """The version of the rig that the cell runs on."""
+    rig_note: str = ""
+    """What somebody should know of the choice of that version."""
+
+    @property
+    def rig_version(self) -> int:
+        """Its number; 0: unknown."""
+        return self.rig.version if self.rig is not None else 0

@@ -366,8 +366,8 @@ def test_the_stored_description_is_current() -> None:
 
 # schemathesis chooses with the random module, which the seed below also sets
 @pytest.mark.filterwarnings("ignore:Do not use the `random` module:hypothesis.errors.HypothesisDeprecationWarning")
-def test_every_route_keeps_its_description(free_port: int) -> None:
-    with serving(free_port) as served:
+def test_every_route_keeps_its_description(free_port: int, tmp_path: Path) -> None:
+    with serving(free_port, calibration={"directory": tmp_path, "board": "charuco:9x6:0.025"}) as served:
         served.post()
         served.client.get("/v1/cycles/1/left.png")
         document = served.client.get("/v1/openapi.json").json()

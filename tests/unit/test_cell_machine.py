@@ -9,10 +9,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from binpick import settings
-from binpick.cell import machine
+from binpick.calibration import SampleRequest
+from binpick.cell import installation, machine
 from binpick.cell.machine import State
 from binpick.data import CameraStatus
-from binpick.errors import Busy, Code, InputError, NotApplicable, NotReady
+from binpick.errors import Busy, Code, InputError, NotApplicable, NotInControl, NotReady
 from binpick.result import (
     Funnel,
     GraspMessage,
@@ -226,6 +227,34 @@ class AnyOrder(RuleBasedStateMachine):
             assert phase == "ready"
             assert not self.state.valid
 
+    @rule(timeout=st.integers(1, 5))
+    def somebody_else_looks_at_a_board(self, timeout: int) -> None:
+        before = self.state
+        try:
+            self.go(installation.sample(self.state, Request(), JOB, self.now, timeout * S, SampleRequest(), "rest", "modbus"))
+        except (Busy, NotReady, NotInControl):
+            assert before.phase != "ready" or before.valid
+        else:
+            assert before.phase == "ready"
+            assert (self.state.valid, self.state.withdrawn) == (False, before.withdrawn)
+
+    @rule()
+    def the_rig_is_held(self) -> None:
+        idle = self.state.ticket is None
+        try:
+            self.go(installation.hold(self.state, "held", "modbus", "modbus"))
+        except (Busy, NotReady):
+            assert not idle or self.state.held
+        else:
+            assert idle
+            assert self.state.phase != "ready"
+
+    @precondition(lambda self: self.state.held)
+    @rule()
+    def the_rig_is_given_back(self) -> None:
+        assert self.state.ticket is None      # nothing could start meanwhile
+        self.go(installation.release(self.state))
+
     @precondition(lambda self: self.state.ticket is not None and self.hand is None)
     @rule()
     def worker_takes_the_ticket(self) -> None:
@@ -295,7 +324,8 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def ready_means_a_trigger_would_be_taken(self) -> None:
-        assert (self.state.phase == "ready") == (self.state.cameras_up and self.state.ticket is None)
+        free = self.state.ticket is None and not self.state.held
+        assert (self.state.phase == "ready") == (self.state.cameras_up and free)
         assert machine.snapshot(self.state, 1, "rest").current == (self.state.running.cycle_id if self.state.running else 0)
 
 

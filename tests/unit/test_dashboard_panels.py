@@ -6,11 +6,14 @@ from html.parser import HTMLParser
 import pytest
 
 from binpick import health
+from binpick.calibration import Progress, Sample, SampleAnswer, Sighting
 from binpick.data import CameraStatus
 from binpick.errors import Code
-from binpick.publish.dashboard import panels, words
+from binpick.message import CalibrationMessage, Level, MarksMessage
+from binpick.publish.dashboard import panels, trend, views, words
 from binpick.result import (
     BinMessage,
+    Drift,
     Funnel,
     GraspMessage,
     PoseMessage,
@@ -106,6 +109,30 @@ def test_the_funnel_names_the_reason_and_leaves_out_what_took_nothing() -> None:
     assert words.stage("collide") not in shown
 
 
+def looked(cells: list[list[int | None]], missing: tuple[str, ...],
+           reason: str = "new: the middle of the left image") -> Snapshot:
+    sightings = tuple(Sighting(camera=name, found=True, points=54) for name in ("left", "right"))
+    sample = Sample(id=5, captured_at="2026-01-02T03:04:05Z", board="chessboard:9x6:0.025", simulated=False, rig_sha256="",
+                    cameras_sha256="", T_base_flange=None, sightings=sightings, useful=True, reason=reason)
+    coverage = {"views": 5, "wanted": 12, "cells": {"left": cells, "right": cells}}
+    answer = SampleAnswer(sample=sample, progress=Progress(enough=not missing, missing=missing, coverage=coverage))
+    return snapshot(replace(published(Code.OK), sample=answer))
+
+
+def test_views_of_a_board_take_the_place_of_grasps() -> None:
+    shown = Text(views.panel(looked([[None, 0, 3]], ("the left edge of the left image", "b", "c", "d", "e")))).all
+    assert "Views of the board: 5 of 12" in shown
+    assert "new: the middle of the left image" in shown
+    assert "the left edge of the left image" in shown
+    assert "and 1 more" in shown
+    markup = views.panel(looked([[None, 0, 3]], ()))
+    assert '<i class="out"></i><i class="open"></i><i class="seen">3</i>' in markup
+    assert "Enough" in Text(markup).all
+    assert views.panel(snapshot(published(Code.OK, 1))) == ""
+    assert views.panel(snapshot()) == ""
+    assert "<img" not in views.panel(looked([[0]], ("<img src=x>",), reason="<img src=x>"))
+
+
 def test_what_came_from_outside_is_escaped() -> None:
     evil = '<img src=x onerror="alert(1)">'
     latest = published(Code.OK, 1, tool=evil)
@@ -131,6 +158,37 @@ def test_the_banner_tells_the_state_and_its_reason() -> None:
     assert told(replace(ready, phase="starting", cameras=())).word == "STARTING"
     assert told(replace(ready, faults=("internal error, see the log",))).tone == "warn"
     assert told(replace(down, phase="stopping")).tone == "off"
+
+
+def said(level: Level, row_px: float | None = 0.42, marks: MarksMessage | None = None) -> CalibrationMessage:
+    return CalibrationMessage(level=level, sentence="Rows are off.", row_px=row_px, row_sigma_px=0.01, points=90, off_px=0.42,
+                              change_px=None, marks=marks)
+
+
+@pytest.mark.parametrize(("level", "words_", "tone"), [("ok", "holds", "good"), ("warn", "has drifted", "warn"),
+                                                       ("fault", "cannot be trusted", "bad")])
+def test_the_calibration_has_a_word_and_a_curve(level: Level, words_: str, tone: str) -> None:
+    rows = tuple(0.01 * n for n in range(43))
+    known = Drift(level=level, latest=said(level), row_px=rows, cycle_ids=tuple(range(43)))
+    markup = trend.panel(replace(snapshot(), drift=known))
+    shown = Text(markup).all
+    assert words_ in shown
+    assert "rows +0.42 px · no reference marks" in shown
+    assert f'class="camera {tone}"' in markup
+    assert markup.count(",") >= len(rows)
+    assert markup.count("<line ") == 4
+
+
+def test_the_calibrations_panel_says_what_is_not_known() -> None:
+    assert trend.panel(snapshot()) == ""
+    shown = Text(trend.panel(replace(snapshot(), drift=Drift(marks="to be stored")))).all
+    assert "Calibration not looked at yet" in shown
+    assert "rows not measured · reference marks not stored" in shown
+    one = Drift(latest=said("ok", None), row_px=(0.1,), cycle_ids=(1,), marks="stored")
+    assert "reference marks not seen" in Text(trend.panel(replace(snapshot(), drift=one))).all
+    marks = MarksMessage(seen=6, shift_m=0.0014, turn_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, roll_rad=0.0, depth_m=0.0)
+    moved = replace(one, latest=said("warn", -0.1, marks))
+    assert "rows −0.10 px · 6 marks, moved 1.40 mm" in Text(trend.panel(replace(snapshot(), drift=moved))).all
 
 
 def test_a_result_that_was_taken_back_says_why() -> None:

@@ -198,7 +198,7 @@ def test_an_unknown_bin_is_not_exchanged_and_a_busy_cell_exchanges_none(ready: B
 
 
 @pytest.mark.parametrize(("command", "code"), [
-    (0, Code.BAD_ARGUMENT), (10, Code.BAD_ARGUMENT), *((c, Code.NOT_APPLICABLE) for c in range(2, 8))])
+    (0, Code.BAD_ARGUMENT), (10, Code.BAD_ARGUMENT), *((c, Code.NOT_APPLICABLE) for c in (2, 3, 4, 6))])
 def test_commands_that_do_not_exist(ready: Bench, command: int, code: Code) -> None:
     assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=command) == Status.NACK
     assert (ready.shown.code, ready.shown.latched, ready.shown.cmd_seq) == (code, code, 10)
@@ -294,6 +294,25 @@ def test_a_scene_that_says_no_is_valid(busy: Bench, code: int) -> None:
     (1, Status.WARN), (2, Status.WARN | Status.CALIB_WARN), (3, Status.WARN), (0, Status(0))])
 def test_warnings(busy: Bench, code: int, bits: Status) -> None:
     assert busy.finish(code) & (Status.WARN | Status.CALIB_WARN) == bits
+
+
+def test_the_warning_stays_while_the_calibration_drifts(busy: Bench) -> None:
+    busy.cell(drifting=True)
+    assert busy.finish(101, grasps=0) & (Status.WARN | Status.CALIB_WARN) == Status.CALIB_WARN
+    busy.plc(ENABLE | TRIG | RES_ACK)
+    assert busy.plc(ENABLE) == Status.READY | Status.CALIB_WARN
+    assert busy.cell(drifting=False) == Status.READY
+
+
+@pytest.mark.parametrize(("code", "bits"), [
+    (0, Status.VALID), (2, Status.VALID | Status.WARN | Status.CALIB_WARN), (-24, Status.ERROR)])
+def test_command_5_looks_at_the_calibration_and_is_answered_like_a_cycle(ready: Bench, code: int, bits: Status) -> None:
+    assert ready.plc(ENABLE | TRIG, cmd_seq=10, command=5) == Status.ACK | Status.BUSY
+    assert ready.taken() == [Start()]
+    assert ready.finish(code, grasps=0) & (Status.VALID | Status.ERROR | Status.WARN | Status.CALIB_WARN) == bits
+    assert (ready.shown.command, ready.shown.code) == (5, code)
+    ready.plc(ENABLE | TRIG | RES_ACK, command=5)
+    assert Status.READY in ready.plc(ENABLE)
 
 
 def test_a_cell_that_never_answers_ends_with_its_time_limit(busy: Bench) -> None:

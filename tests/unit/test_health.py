@@ -4,12 +4,11 @@ import pytest
 
 from binpick import health
 from binpick.data import CameraStatus
-from binpick.errors import Code
-from binpick.result import Published, Request, Snapshot, failure
+from binpick.result import Drift, Snapshot
 
 UP = (CameraStatus("left", True), CameraStatus("right", True))
 DOWN = (CameraStatus("left", True), CameraStatus("right", False, error="no camera answers at 10.0.0.2"))
-RESULT = failure(1, Request(), Code.CALIBRATION_WARNING)
+DRIFTED, GONE = (Drift(level=level, attention=(f"rows are off: {level}",)) for level in ("warn", "fault"))
 
 
 @pytest.mark.parametrize(("snapshot", "expected"), [
@@ -20,8 +19,11 @@ RESULT = failure(1, Request(), Code.CALIBRATION_WARNING)
     (Snapshot(1, "starting", cameras=UP), ("degraded", False, ("a withdrawn cycle is still being cleared away",))),
     (Snapshot(1, "stopping", cameras=UP), ("degraded", False, ("the cell is stopping",))),
     (Snapshot(1, "ready", cameras=UP, faults=("internal error",)), ("degraded", True, ("internal error",))),
-    (Snapshot(1, "ready", cameras=UP, latest=Published(RESULT, b"", 0)),
-     ("degraded", True, (Code.CALIBRATION_WARNING.message,))),
+    (Snapshot(1, "ready", cameras=UP, drift=Drift(unseen=("a turn about the vertical",))), ("ok", True, ())),
+    (Snapshot(1, "ready", cameras=UP, drift=Drift(marks="to be stored", attention=("store them",))),
+     ("degraded", True, ("store them",))),
+    (Snapshot(1, "ready", cameras=UP, drift=DRIFTED), ("degraded", True, ("rows are off: warn",))),
+    (Snapshot(1, "ready", cameras=UP, drift=GONE), ("fault", True, ("rows are off: fault",))),
 ])
 def test_the_facts_give_the_judgement(snapshot: Snapshot, expected: tuple[str, bool, tuple[str, ...]]) -> None:
     judged = health.judge(snapshot)

@@ -1,6 +1,7 @@
 """The register image word by word, and requests out of the words of a PLC."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from hypothesis import strategies as st
 from binpick import poses
 from binpick.data import CameraStatus
 from binpick.errors import Code, InputError
+from binpick.message import CalibrationMessage, CorrectionMessage, MarksMessage
 from binpick.poses import PoseFormat
 from binpick.publish import image
 from binpick.publish.image import Echo, Signals
 from binpick.publish.registers import Status, WordOrder
 from binpick.result import (
     BinMessage,
+    Drift,
     GraspMessage,
     PoseMessage,
     Published,
@@ -80,7 +83,7 @@ UNITS = ((100, 119), (120, 145), (146, 171), (172, 197), (198, 223), (100, 224),
 def test_identity_is_made_of_literal_words() -> None:
     words = image.encode(snapshot(), signals())
     assert len(words) == 360
-    assert words[:8] == (0xB1D0, 1, 0x0102, 0x0304, 0x47F1, 0x2000, 1 << 1 | 1 << 8 | 1 << 9, 4)
+    assert words[:8] == (0xB1D0, 1, 0x0102, 0x0304, 0x47F1, 0x2000, 1 << 1 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9, 4)
     assert words[10] == VALID == 0b110010
     assert words[12:16] == (2, 1, 0b1001, 0)
 
@@ -277,3 +280,19 @@ def test_the_echo_leaves_the_tool_open_where_a_recipe_has_several() -> None:
     job = Job(recipe=Recipe(number=4), tools=(SuctionTool(number=9), TwoFingerTool(number=2, kind="two_finger")),
               bin=Bin(number=5, inner_size_m=(0.6, 0.4, 0.2), pose=Pose()))
     assert Echo.of(Request(), job).tool == 0
+
+
+def test_the_watchdogs_figures_stand_in_the_diagnostics() -> None:
+    marks = MarksMessage(seen=6, shift_m=0.00123, turn_rad=0.0004, pitch_rad=0.0, yaw_rad=0.0003, roll_rad=0.0, depth_m=-0.0021)
+    seen = CalibrationMessage(level="warn", sentence="", row_px=-0.0125, row_sigma_px=0.01, points=90, off_px=0.42,
+                              change_px=None, marks=marks,
+                              correction=CorrectionMessage(rotation_rad=(0.0003, -0.0004, 0.0), rig_sha256="0"))
+    words = image.encode(replace(snapshot(), drift=Drift(level="warn", latest=seen)), signals())
+    # level, row error, what counts, its change (unknown), marks, shift, turn, depth, correction; then spare
+    assert words[346:356] == (2, 0x10000 - 12, 420, 0x8000, 6, 123, 40, 0x10000 - 210, 500, 0)
+    assert whole(words, 320, 359)
+    nothing = image.encode(replace(snapshot(), drift=Drift()), signals())
+    assert nothing[346:356] == (0, 0x8000, 0x8000, 0x8000, 0, 0, 0, 0x8000, 0, 0)
+    far = seen.model_copy(update={"off_px": 400.0, "marks": marks.model_copy(update={"shift_m": 3.0})})
+    beyond = image.encode(replace(snapshot(), drift=Drift(latest=far)), signals())
+    assert (beyond[348], beyond[351], beyond[10] & Status.ERROR) == (32700, 3270, 0)      # never wraps, never stops a pick

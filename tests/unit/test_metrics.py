@@ -1,6 +1,7 @@
 """The text Prometheus reads."""
 
 import math
+from dataclasses import replace
 
 from binpick.metrics import Facts, Metrics
 
@@ -43,6 +44,15 @@ def test_asks_the_cell_at_every_scrape() -> None:
     assert sample(text, "binpick_refused_total") == 3
     assert math.isnan(sample(text, "binpick_frame_age_seconds"))
     assert sample(text, "binpick_ready") == 0
+
+
+def test_what_the_watchdog_could_not_measure_is_absent() -> None:
+    now = replace(facts(), calibration={"level": 1.0, "row_px": -0.4})
+    text = Metrics(lambda: now).text().decode()
+    assert sample(text, "binpick_calibration_level") == 1
+    assert sample(text, "binpick_calibration_row_px") == -0.4
+    assert "binpick_calibration_marks" not in text
+    assert "binpick_calibration" not in Metrics(facts).text().decode()
 
 
 def test_two_apps_in_one_process_do_not_meet() -> None:

@@ -9,15 +9,21 @@ from types import MappingProxyType, TracebackType
 
 from binpick import pipeline, settings
 from binpick.camera.base import Clock
-from binpick.cell import machine, memory, store, worker
+from binpick.cell import machine, memory, store, watchdog, worker
 from binpick.cell.board import Board
+from binpick.cell.calibration import Calibration
 from binpick.cell.gallery import Gallery
+from binpick.cell.logbook import Logbook
 from binpick.cell.meter import Meter
+from binpick.cell.rigs import Rigs
+from binpick.cell.samples import SampleStore
 from binpick.cell.worker import Cameras, Pose, Run, Worker
-from binpick.errors import CycleRefused, NotInControl
+from binpick.errors import CycleRefused, InputError, NotInControl
+from binpick.message import Verify
 from binpick.recording import Recorder
 from binpick.result import Artefact, Published, Request, Snapshot, Source
 from binpick.rig import Rig
+from binpick.rigcheck import board
 
 STOP_LIMIT_S = 2.0
 """How long the running step may take to end before its thread is abandoned."""
@@ -34,17 +40,24 @@ class Cell:
 
     def __init__(self, cell: settings.Cell, rig: Rig, cameras: Cameras, run: Run = pipeline.grasps, *, boot_id: int,
                  pose: Pose = pipeline.poses, recorder: Recorder | None = None, clock: Clock = time.monotonic_ns) -> None:
-        self._settings, self._rig, self._clock = cell, rig, clock
+        self._settings, self._clock = cell, clock
+        rigs = Rigs(cell.calibration_directory, cell.rig, rig)
         kept = store.Store(cell.memory.directory) if cell.memory.directory is not None else None
         memories, trouble = kept.load() if kept is not None else ({}, "")
-        if trouble:
-            log.error(trouble)
+        installed, logbook = rigs.chosen(), Logbook(cell.calibration_directory)
+        guard = logbook.guard(cell, installed.rig)
+        troubles = tuple(each for each in (trouble, logbook.trouble) if each)
+        for each in troubles:
+            log.error(each)
         self._board = Board(machine.State(
-            max_age_ns=cell.result_max_age_ms * 1_000_000, memories=MappingProxyType(memories),
-            faults=(trouble,) if trouble else ()), boot_id, cell.control)
+            max_age_ns=cell.result_max_age_ms * 1_000_000, memories=MappingProxyType(memories), rig=installed,
+            faults=troubles), boot_id, cell.control)
+        self._board.step(watchdog.watching, guard)
+        self.calibration = Calibration(self._board, cell, rigs, SampleStore(cell.calibration_directory), clock)
+        """What may be asked for about the rig: implements publish.ports.Calibration."""
         self._gallery = Gallery()
         self._thread = worker.thread(Worker(self._board, self._gallery, cameras, rig, run, pose, recorder, clock,
-                                           Meter(rig)))
+                                           Meter(rig), self.calibration, logbook))
         self._keeper = store.thread(kept, self._board) if kept is not None else None
         self._supervisor: asyncio.Task[None] | None = None
 
@@ -76,9 +89,30 @@ class Cell:
         try:
             self._admit(source)
             job = settings.resolve(self._settings, request.recipe, request.bin, request.tool)
-            pipeline.admit(self._rig, job, request)
+            pipeline.admit(self._board.state.installed.rig, job, request)
             timeout_ns = (request.timeout_ms or self._settings.timeout_ms) * 1_000_000
             return self._board.step(machine.start, request, job, self._clock(), timeout_ns).last_id
+        except CycleRefused:
+            self._board.step(machine.refused)
+            raise
+
+    def verify(self, wanted: Verify, request: Request, source: Source) -> int:
+        """Starts a look at the calibration alone and returns its id at once.
+
+        Whoever does not control the cell may do so while it is idle. Raises like `start`, and InputError for a board that
+        cannot be or marks that are to be stored and not configured; nothing has changed then.
+        """
+        try:
+            if wanted.board:
+                board.parse(wanted.board)
+            if wanted.store_marks and self._settings.reference_marks is None:
+                raise InputError("there are no marks to store: configure reference_marks in the cell file")
+            job = settings.resolve(self._settings, request.recipe, request.bin, request.tool)
+            pipeline.admit(self._board.state.installed.rig, job, request)
+            timeout_ns = (request.timeout_ms or self._settings.timeout_ms) * 1_000_000
+            owner = self._settings.control
+            return self._board.step(watchdog.verify, request, job, self._clock(), timeout_ns, wanted, source,
+                                    owner).last_id
         except CycleRefused:
             self._board.step(machine.refused)
             raise

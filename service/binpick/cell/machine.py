@@ -9,10 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+from binpick.calibration import Installed, SampleRequest
 from binpick.data import CameraStatus
 from binpick.errors import Busy, Code, InputError, NotApplicable, NotReady
+from binpick.message import Verify
 from binpick.outcomes import Memory
-from binpick.result import Owner, Phase, Published, Request, Snapshot, failure
+from binpick.result import Drift, Owner, Phase, Published, Request, Snapshot, failure
+from binpick.rigcheck.guard import Guard
 from binpick.settings import Job
 
 KEPT = 16
@@ -25,7 +28,11 @@ TRIGGERED_AGAIN, ACKNOWLEDGED = "triggered again", "acknowledged"
 
 @dataclass(frozen=True, slots=True)
 class Ticket:
-    """The cycle that occupies the slot; `retired` once its id counts no more though the worker still holds it."""
+    """The cycle that occupies the slot; `retired` once its id counts no more though the worker still holds it.
+
+    `sample`: it takes a pair of images of a board and computes no grasps; `verify`: it looks at the calibration alone. `aside`:
+    by somebody who does not control the cell; its result is kept, but does not take the published one's place.
+    """
 
     cycle_id: int
     request: Request
@@ -34,13 +41,17 @@ class Ticket:
     deadline_ns: int
     acquired: bool = False
     retired: bool = False
+    sample: SampleRequest | None = None
+    verify: Verify | None = None
+    aside: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class State:
     """All that the cell knows; times are the host's monotonic clock.
 
-    `memories` are by bin; `exchanged` is the last cycle that saw a bin's predecessor.
+    `memories` are by bin; `exchanged` is the last cycle that saw a bin's predecessor. `rig` and `guard` are what the next cycle
+    and its watchdog start from, `drift` is what people are told; `held`: why none may start though the cameras are up.
     """
 
     max_age_ns: int
@@ -54,7 +65,11 @@ class State:
     finished: tuple[Published, ...] = ()
     outcomes: Mapping[tuple[int, int], int] = field(default_factory=lambda: MappingProxyType({}))
     memories: Mapping[int, Memory] = field(default_factory=lambda: MappingProxyType({}))
+    guard: Guard | None = None
+    drift: Drift | None = None
     exchanged: Mapping[int, int] = field(default_factory=lambda: MappingProxyType({}))
+    rig: Installed | None = None
+    held: str = ""
     faults: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -62,6 +77,12 @@ class State:
     def running(self) -> Ticket | None:
         """The cycle in flight, or None."""
         return self.ticket if self.ticket is not None and not self.ticket.retired else None
+
+    @property
+    def installed(self) -> Installed:
+        """The rig in use; a cell has one from its start."""
+        assert self.rig is not None
+        return self.rig
 
     @property
     def cameras_up(self) -> bool:
@@ -75,21 +96,24 @@ class State:
 
     @property
     def phase(self) -> Phase:
-        """"starting" is every not-ready that can end by itself: cameras down, or a retired cycle still in the slot."""
+        """"starting" is every not-ready that can end by itself: cameras down, a retired cycle still in the slot, or held."""
         if self.stopping:
             return "stopping"
         if self.running is not None:
             return "computing" if self.running.acquired else "acquiring"
-        return "ready" if self.cameras_up and self.ticket is None else "starting"
+        return "ready" if self.cameras_up and self.ticket is None and not self.held else "starting"
 
 
-def start(state: State, request: Request, job: Job, now_ns: int, timeout_ns: int) -> State:
+def start(state: State, request: Request, job: Job, now_ns: int, timeout_ns: int, sample: SampleRequest | None = None,
+          verify: Verify | None = None, aside: bool = False) -> State:
     """Takes the slot; `last_id` of the new state names the cycle. What was published is withdrawn.
 
     Raises NotReady, Busy: the state is unchanged then.
     """
     if state.stopping:
         raise NotReady("the cell is stopping")
+    if state.held:
+        raise Busy(f"{state.held}: trigger again when the cell is ready")
     if state.ticket is not None:
         raise Busy(f"cycle {state.ticket.cycle_id} is running; nothing is queued: trigger again when the cell is ready"
                    if not state.ticket.retired else
@@ -99,7 +123,7 @@ def start(state: State, request: Request, job: Job, now_ns: int, timeout_ns: int
         raise NotReady("the cell is not ready: " + (_cameras_down(state) or "the cameras are being opened"))
     state = invalidate(state, TRIGGERED_AGAIN)
     cycle_id = state.last_id + 1
-    ticket = Ticket(cycle_id, request, job, started_ns=now_ns, deadline_ns=now_ns + timeout_ns)
+    ticket = Ticket(cycle_id, request, job, now_ns, now_ns + timeout_ns, sample=sample, verify=verify, aside=aside)
     return _count(replace(state, last_id=cycle_id, ticket=ticket), "started")
 
 
@@ -127,6 +151,7 @@ def finish(state: State, cycle_id: int, published: Published | None, fault: str 
     cycle ends well.
     """
     retired = state.running is None or state.running.cycle_id != cycle_id
+    aside = state.ticket is not None and state.ticket.aside
     if state.ticket is not None and state.ticket.cycle_id == cycle_id:
         state = replace(state, ticket=None)
     if published is None:
@@ -142,7 +167,7 @@ def finish(state: State, cycle_id: int, published: Published | None, fault: str 
         fault = "the last gate stopped " + ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in stopped.items())
     if fault or published.result.return_code.value >= 0:
         state = replace(state, faults=(fault,) if fault else ())
-    return _publish(state, published)
+    return _publish(state, published, aside)
 
 
 def complete(state: State, fuller: Published) -> State:
@@ -244,7 +269,8 @@ def snapshot(state: State, boot_id: int, owner: Owner) -> Snapshot:
         acquired=running.acquired if running else False,
         published=state.published, valid=state.valid, withdrawn=state.withdrawn,
         latest=state.finished[-1] if state.finished else None, cameras=state.cameras, faults=state.faults, owner=owner,
-        simulated=state.simulated, counts=tuple(sorted(state.counts.items())))
+        simulated=state.simulated, counts=tuple(sorted(state.counts.items())), drift=state.drift,
+        rig=state.rig.told if state.rig is not None else None, rig_note=state.rig.note if state.rig is not None else "")
 
 
 def _retire(state: State, code: Code, now_ns: int, why: str = "") -> State:
@@ -253,14 +279,16 @@ def _retire(state: State, code: Code, now_ns: int, why: str = "") -> State:
     assert ticket is not None
     result = failure(ticket.cycle_id, ticket.request, code, why, simulated=state.simulated)
     state = replace(state, ticket=replace(ticket, retired=True))
-    return _publish(state, Published(result, result.json_bytes(), triggered_ns=now_ns))
+    return _publish(state, Published(result, result.json_bytes(), triggered_ns=now_ns), ticket.aside)
 
 
-def _publish(state: State, published: Published) -> State:
+def _publish(state: State, published: Published, aside: bool = False) -> State:
     finished = (*state.finished, published)[-KEPT:]
     oldest = finished[0].result.cycle_id
     outcomes = MappingProxyType({key: value for key, value in state.outcomes.items() if key[0] >= oldest})
-    state = replace(state, published=published, valid=True, withdrawn="", finished=finished, outcomes=outcomes)
+    state = replace(state, finished=finished, outcomes=outcomes)
+    if not aside:
+        state = replace(state, published=published, valid=True, withdrawn="")
     return _count(state, "finished")
 
 

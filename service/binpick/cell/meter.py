@@ -12,6 +12,7 @@ from binpick.camera import exposure
 from binpick.camera.exposure import Limits, Search
 from binpick.cycle import CycleInput
 from binpick.data import CameraStatus, Light, StereoPair
+from binpick.errors import FrameUnavailable
 from binpick.frames import Frames
 from binpick.geometry import Transform
 from binpick.message import Metering
@@ -48,6 +49,10 @@ class Meter:
         self._rig = rig
         self._searches: dict[tuple[str, bool], Search] = {}
 
+    def use(self, rig: Rig) -> None:
+        """From here on the cameras stand as in this rig."""
+        self._rig = rig
+
     def settle(self, job: Job, request: Request, cameras: Sequence[CameraStatus], capture: Capture) -> Settled:
         """The recipe's lights; metered ones as they were found, by test shots where nothing is known. Raises as `capture`."""
         bases = {light.projector: light for light in reversed(job.recipe.lights) if light.metered}
@@ -83,9 +88,13 @@ class Meter:
         return search
 
     def _level(self, job: Job, request: Request, pair: StereoPair) -> float:
-        T_camera_bin = Frames.of(CycleInput(0, pair, self._rig, job, request)).T_camera_bin
-        images = tuple(frame.image[_window(frame.image.shape, camera, T_camera_bin, job.bin.inner_size_m)]
-                       for frame, camera in zip(pair.frames, self._rig.cameras, strict=False))
+        try:
+            T_camera_bin = Frames.of(CycleInput(0, pair, self._rig, job, request)).T_camera_bin
+        except FrameUnavailable:     # before the hand-eye calibration nobody knows where the bin is: samples for it are metered
+            images = tuple(frame.image for frame in pair.frames)
+        else:
+            images = tuple(frame.image[_window(frame.image.shape, camera, T_camera_bin, job.bin.inner_size_m)]
+                           for frame, camera in zip(pair.frames, self._rig.cameras, strict=False))
         return exposure.level(images, job.recipe.auto.percentile)
 
 

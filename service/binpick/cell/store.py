@@ -1,7 +1,6 @@
 """The memories of all bins in one file that survives the process: written whole beside itself, then put in its place."""
 
 import logging
-import os
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from binpick.cell import machine
+from binpick.cell import durable, machine
 from binpick.cell.board import Board
 from binpick.cell.machine import State
 from binpick.errors import InputError
@@ -63,17 +62,7 @@ class Store:
     def save(self, memories: Mapping[int, Memory]) -> None:
         """Replaces the file; whenever process or machine die, the old or the new one is there whole. Raises OSError."""
         file = MemoryFile(bins=lasting(memories))
-        partial = self._directory / f".{NAME}"
-        with partial.open("wb") as opened:
-            opened.write(file.model_dump_json(indent=1).encode())
-            opened.flush()
-            os.fsync(opened.fileno())
-        partial.replace(self._directory / NAME)
-        folder = os.open(self._directory, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        durable.replace(self._directory / NAME, file.model_dump_json(indent=1).encode())
 
 
 def lasting(memories: Mapping[int, Memory]) -> dict[int, Memory]:

@@ -5,14 +5,17 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
+from binpick.calibration import SampleAnswer, SampleRequest
 from binpick.camera.base import Clock, MonotonicNs, remaining_s
-from binpick.cell import machine
+from binpick.cell import machine, watchdog
 from binpick.cell import memory as memories
 from binpick.cell.board import Board
+from binpick.cell.calibration import Calibration
 from binpick.cell.gallery import Gallery
+from binpick.cell.logbook import Logbook
 from binpick.cell.machine import State, Ticket
 from binpick.cell.meter import Meter
 from binpick.cycle import CycleInput, CycleResult
@@ -73,7 +76,10 @@ Pose = Callable[[CycleInput, CycleResult, Callable[[], None]], CycleResult]
 
 @dataclass(frozen=True, slots=True)
 class Worker:
-    """What the thread needs; `run` is the pipeline up to the grasps, `pose` adds the parts' poses once those are out."""
+    """What the thread needs; `run` is the pipeline up to the grasps, `pose` adds the parts' poses once those are out.
+
+    `rig` is what cycles run on unless another one was installed; `calibration` keeps samples, where they can be asked for.
+    """
 
     board: Board
     gallery: Gallery
@@ -84,6 +90,8 @@ class Worker:
     recorder: Recorder | None
     clock: Clock
     meter: Meter
+    calibration: Calibration | None = None
+    logbook: Logbook = field(default_factory=lambda: Logbook(None))
 
     def live(self) -> None:
         """The thread's body: opens cameras, waits for tickets, until the cell stops."""
@@ -124,10 +132,13 @@ class Worker:
         return Attempts(attempts.failed + 1, self.clock() + int(pause_s * 1e9))
 
     def _cycle(self, ticket: Ticket) -> None:
-        fault, inputs, cycle = "", None, None
+        fault, inputs, cycle, sample = "", None, None, None
         try:
-            inputs = self._acquire(ticket)
-            cycle = self._compute(ticket, inputs)
+            if ticket.sample is not None:
+                cycle, sample = self._sampled(ticket, ticket.sample)
+            else:
+                inputs = self._acquire(ticket)
+                cycle = self._compute(ticket, inputs)
         except CycleAborted:
             self.board.step(machine.finish, ticket.cycle_id, None)
             return
@@ -140,17 +151,15 @@ class Worker:
             cycle = CycleResult(self._failure(ticket, Code.NOT_READY, INTERNAL_ERROR))
         result, finished_ns = cycle.result, self.clock()
         triggered_ns = _triggered_ns(inputs.pair) if inputs else finished_ns
-        published = Published(result, result.json_bytes(), triggered_ns, cycle.attempts)
+        published = Published(result, result.json_bytes(), triggered_ns, cycle.attempts, sample)
         # cameras first: who sees the result and triggers again must not be told READY by cameras that just died
         self.board.step(machine.observe, self.cameras.statuses())
         state = self.board.step(machine.finish, ticket.cycle_id, published, fault)
         if machine.find(state, ticket.cycle_id) is not published:
             log.warning("cycle %d: its late result was dropped", ticket.cycle_id)
             return
-        if inputs is not None and cycle.memory is not None:
-            self.board.step(memories.remember, ticket.cycle_id, ticket.job.bin.number, inputs.memory, cycle.memory)
-        for seen in cycle.verified:
-            log.info("cycle %d grasp %d: outcome %d by the cameras", seen.cycle_id, seen.grasp, seen.outcome)
+        self._remember(ticket, inputs, cycle)
+        self._watched(ticket, inputs, cycle)
         log.info("cycle %d: %d %s, %d grasps, %.0f ms", ticket.cycle_id, result.return_code.value, result.return_code.name,
                  len(result.grasps), (finished_ns - ticket.started_ns) / 1e6)
         if result.stopped:
@@ -159,6 +168,21 @@ class Worker:
             result = self._posed(inputs, cycle, published)
         if self.recorder is not None and inputs is not None:
             self.recorder.offer(inputs, result)
+
+    def _remember(self, ticket: Ticket, inputs: CycleInput | None, cycle: CycleResult) -> None:
+        if inputs is not None and cycle.memory is not None:
+            self.board.step(memories.remember, ticket.cycle_id, ticket.job.bin.number, inputs.memory, cycle.memory)
+        for seen in cycle.verified:
+            log.info("cycle %d grasp %d: outcome %d by the cameras", seen.cycle_id, seen.grasp, seen.outcome)
+
+    def _watched(self, ticket: Ticket, inputs: CycleInput | None, cycle: CycleResult) -> None:
+        """The watchdog's word, for the next cycle and for people."""
+        seen = cycle.result.calibration
+        if inputs is None or inputs.guard is None or cycle.guard is None or seen is None:
+            return
+        self.board.step(watchdog.keep, ticket.cycle_id, inputs.guard, cycle.guard, seen)
+        if trouble := self.logbook.note(ticket.cycle_id, inputs.guard, cycle.guard, seen):
+            self.board.step(machine.alarm, trouble)
 
     def _posed(self, inputs: CycleInput, cycle: CycleResult, published: Published) -> Result:
         """The result with its parts' poses, in the place of the published one; without them when the next cycle is wanted."""
@@ -184,14 +208,29 @@ class Worker:
     def _acquire(self, ticket: Ticket) -> CycleInput:
         """All shots of the recipe, one after the other; they are accepted together, after the last."""
         statuses = self.cameras.statuses()
+        self.meter.use(self._rig)
         settled = self.meter.settle(ticket.job, ticket.request, statuses, lambda light: self._shoot(ticket, light))
         pairs = [self._shoot(ticket, light) for light in settled.lights]
         self.meter.watch(ticket.job, ticket.request, settled.lights, pairs)
         simulated = any(status.simulated for status in statuses)
         self.board.step(machine.acquired, ticket.cycle_id)
         memory = memories.recall(self.board.state, ticket.job.bin.number)
-        return CycleInput(ticket.cycle_id, pairs[0], self.rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]), memory,
-                          settled.outcome)
+        return CycleInput(ticket.cycle_id, pairs[0], self._rig, ticket.job, ticket.request, simulated, tuple(pairs[1:]), memory,
+                          settled.outcome, watchdog.recall(self.board.state, self._rig), ticket.verify)
+
+    def _sampled(self, ticket: Ticket, wanted: SampleRequest) -> tuple[CycleResult, SampleAnswer | None]:
+        """One pair of a board, kept as a sample; whether it was seen is the code."""
+        assert self.calibration is not None
+        inputs, acquired_ns = self._acquire(ticket), self.clock()
+        answer = self.calibration.keep(wanted, inputs, lambda: self._proceed(ticket))
+        cycle = CycleResult(self._failure(ticket, answer.sample.code, answer.sample.sentence))
+        return self._timed(ticket, cycle, acquired_ns), answer
+
+    @property
+    def _rig(self) -> Rig:
+        """It does not change while a ticket holds the slot."""
+        installed = self.board.state.rig
+        return installed.rig if installed is not None else self.rig
 
     def _shoot(self, ticket: Ticket, light: Light) -> StereoPair:
         """One accepted pair of this cycle."""
@@ -208,9 +247,14 @@ class Worker:
         try:
             self._proceed(ticket)
             cycle = self.run(inputs, lambda: self._proceed(ticket))
+            if ticket.verify is not None:       # who stores marks is told when they are not on disk
+                self.logbook.keep(inputs.guard, cycle.guard)
         finally:
             if self._counts(ticket):
                 self.gallery.keep(inputs, cycle)
+        return self._timed(ticket, cycle, acquired_ns)
+
+    def _timed(self, ticket: Ticket, cycle: CycleResult, acquired_ns: MonotonicNs) -> CycleResult:
         times = {"acquire": (acquired_ns - ticket.started_ns) / 1e6, **cycle.result.timing_ms,
                  "total": (self.clock() - ticket.started_ns) / 1e6}
         rounded = {name: round(ms, 3) for name, ms in times.items()}

@@ -56,7 +56,6 @@ def check(
 def findings(path: Path) -> Iterator[Finding]:
     """Looks at one thing after the other; what rests on a broken one is left out."""
     from binpick import app, settings
-    from binpick import rig as rig_file
     from binpick.errors import BinpickError
 
     try:
@@ -68,8 +67,8 @@ def findings(path: Path) -> Iterator[Finding]:
         return
     yield from _ports(cell)
     try:
-        rig, warnings = rig_file.load(cell.rig)
-        yield Finding("rig", "; ".join([f"{cell.rig}: {' and '.join(c.name for c in rig.cameras)}", *warnings]))
+        rig, seen = _rig(cell)
+        yield Finding("rig", seen)
     except BinpickError as error:
         yield Finding("rig", str(cell.rig), str(error), error.exit_code)
         return
@@ -85,6 +84,19 @@ def findings(path: Path) -> Iterator[Finding]:
             yield _tried("a pair of images", partial(_capture, cell, rig, cameras))
     finally:
         cameras.close()
+
+
+def _rig(cell: "Cell") -> tuple["Rig", str]:
+    """The rig that the daemon would run on, and which that is. Raises RigError."""
+    from binpick import rig as rig_file
+    from binpick.cell.rigs import Rigs
+
+    rig, warnings = rig_file.load(cell.rig)
+    installed = Rigs(cell.calibration_directory, cell.rig, rig).chosen()
+    told = [f"{cell.rig}: {' and '.join(c.name for c in rig.cameras)}", *warnings]
+    if installed.rig.sha256 != rig.sha256:
+        told.append(f"version {installed.told.version} was activated and is used, {installed.told.file}")
+    return installed.rig, "; ".join(filter(None, (*told, installed.note)))
 
 
 def _of_host(path: Path) -> Iterator[Finding]:

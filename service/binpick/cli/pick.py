@@ -90,7 +90,9 @@ def _inputs(left: Path, right: Path, rig: "Rig", cell: "Cell", request: "Request
         if recorded.more or recorded.job.recipe.metered or len(job.recipe.lights) > 1:
             job = _exposed(job, recorded.job.recipe)
         flange = request.T_base_flange or recorded.request.T_base_flange
-        return replace(recorded, rig=rig, job=job, request=recorded.request.model_copy(update={"T_base_flange": flange}))
+        guard = recorded.guard.for_rig(rig) if recorded.guard is not None else None
+        asked = recorded.request.model_copy(update={"T_base_flange": flange})
+        return replace(recorded, rig=rig, job=job, guard=guard, request=asked)
     if len(job.recipe.lights) > 1:
         typer.echo(f"two images are one shot: the other {len(job.recipe.lights) - 1} of the recipe are left out", err=True)
         job = _exposed(job, job.recipe.single)

@@ -42,7 +42,7 @@ async def start(
     cycle_id = ports.control.start(body, "rest")
     if not wait:
         return _accepted(cycle_id, ports.view.snapshot())
-    published = await _finished(ports.view, cycle_id)
+    published = await finished(ports.view, cycle_id)
     code = published.result.return_code
     if code.value < 0:
         return problems.respond(request, problems.http_status(code.code), code.code, code.message, cycle_id)
@@ -101,7 +101,7 @@ async def outcome(
     ports.control.report(cycle, int(number), body.code, "rest")
 
 
-async def _finished(view: View, cycle_id: int) -> Published:
+async def finished(view: View, cycle_id: int) -> Published:
     """Waits for the end of a cycle, which its own time limit bounds. Raises NotReady when the cell stops."""
     async with aclosing(snapshots(view)) as changes:
         async for snapshot in changes:
@@ -113,7 +113,7 @@ async def _finished(view: View, cycle_id: int) -> Published:
 
 
 def _taken_back(published: Published, snapshot: Snapshot) -> bool:
-    return (published.result.return_code.code.carries_poses and published is snapshot.latest
+    return (bool(published.result.grasps) and published is snapshot.latest
             and not snapshot.valid and snapshot.withdrawn != ACKNOWLEDGED)
 
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from binpick.calibration import SampleAnswer
 from binpick.errors import Code
-from binpick.publish.registers import Ctrl
+from binpick.publish.registers import Ctrl, Detail
 from binpick.result import Snapshot
 
 NO_CTRL = Ctrl(0)
@@ -20,9 +21,11 @@ class Facts:
     acquired: bool = False
     finished: int = 0
     code: int = 0
+    detail: Detail = Detail.NONE
     valid: bool = False
     grasps: int = 0
     degraded: bool = False
+    drifting: bool = False
     simulated: bool = False
 
     @classmethod
@@ -39,9 +42,23 @@ class Facts:
         return cls(fault=fault.value, controlled=snapshot.owner == "modbus", current=snapshot.current,
                    acquired=snapshot.acquired, finished=latest.cycle_id if latest else 0,
                    code=latest.return_code.value if latest else 0,
+                   detail=_detail(snapshot.latest.sample if snapshot.latest else None),
                    valid=latest is not None and published is not None and published.cycle_id == latest.cycle_id,
                    grasps=len(latest.grasps) if latest else 0, degraded=bool(snapshot.faults),
+                   drifting=snapshot.drift is not None and snapshot.drift.level != "ok",
                    simulated=snapshot.simulated or (published is not None and published.simulated))
+
+
+def _detail(answer: SampleAnswer | None) -> Detail:
+    """What a sample is worth."""
+    if answer is None:
+        return Detail.NONE
+    sample = answer.sample
+    if sample.found < len(sample.sightings):
+        return Detail.BOARD_SEEN_BY_SOME if sample.found else Detail.BOARD_SEEN_BY_NONE
+    if answer.progress.enough:
+        return Detail.SAMPLE_ENOUGH
+    return Detail.SAMPLE_NEW if sample.useful else Detail.SAMPLE_NOT_NEW
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from binpick.publish.registers import PAGE_SIZE, Ctrl, Detail, Status
 
 HEARTBEAT_NS = 2_000_000_000
 COMMANDS = range(1, 10)
-PICK, EXCHANGED, CLEAR = 1, 8, 9
+PICK, VERIFY, SAMPLE, EXCHANGED, CLEAR = 1, 5, 7, 8, 9
 REASONS = {
     Detail.TRIG_FELL: "TRIG fell", Detail.CONNECTION_LOST: "the controller's connection was lost",
     Detail.HEARTBEAT_STOPPED: "the controller's heartbeat stopped", Detail.CLEARED: "the controller cleared errors",
@@ -126,7 +126,7 @@ def signals(state: State, inputs: Inputs) -> Signals:
         Status.ERROR: state.error,
         Status.WARN: valid and 1 <= state.code <= 3,
         Status.LAST_PAGE: valid and (state.page + 1) * PAGE_SIZE >= state.grasps,
-        Status.CALIB_WARN: valid and state.code == Code.CALIBRATION_WARNING,
+        Status.CALIB_WARN: facts.drifting or (valid and state.code == Code.CALIBRATION_WARNING),
         Status.DEGRADED: facts.degraded,
         Status.SIM: facts.simulated,
     }
@@ -199,7 +199,7 @@ def _ended(state: State, facts: Facts) -> State:
     if facts.code < 0:
         return _fail(state, Code(facts.code))
     # A scene was judged, so its pair was accepted, even if both happened between two steps.
-    return replace(state, phase=Phase.DONE, code=facts.code, grasps=facts.grasps, acquired=True)
+    return replace(state, phase=Phase.DONE, code=facts.code, detail=facts.detail, grasps=facts.grasps, acquired=True)
 
 
 def _done(state: State, inputs: Inputs) -> Step:
@@ -256,8 +256,8 @@ def _trigger(state: State, inputs: Inputs) -> Step:
         return state, ()
     if code := _refusal(state, inputs):
         return refused(state, inputs, code), ()
-    if inputs.command in (PICK, EXCHANGED):
-        return state, (Start() if inputs.command == PICK else Forget(),)
+    if inputs.command in (PICK, VERIFY, SAMPLE, EXCHANGED):
+        return state, (Forget() if inputs.command == EXCHANGED else Start(),)
     held = state.phase is Phase.DONE and inputs.facts.valid
     return done(state, inputs), (Withdraw(REASONS[Detail.CLEARED]),) if held else ()
 
@@ -268,7 +268,7 @@ def _refusal(state: State, inputs: Inputs) -> Code:
         return Code.BUSY if state.phase is Phase.BUSY else Code.NOT_READY
     if inputs.command not in COMMANDS:
         return Code.BAD_ARGUMENT
-    if inputs.command not in (PICK, EXCHANGED, CLEAR):
+    if inputs.command not in (PICK, VERIFY, SAMPLE, EXCHANGED, CLEAR):
         return Code.NOT_APPLICABLE
     return Code(_fault(state, inputs))
 

@@ -49,6 +49,9 @@ UNKNOWN_FILL = 65.535
 INT_RANGE: dict[Kind, tuple[int, int]] = {"u16": (0, 0xFFFF), "i16": (-0x7FFF, 0x7FFF), "u32": (0, 0xFFFFFFFF)}
 CHECK_SEED = 0x5A5A
 NO_STATUS = Status(0)
+LEVELS = ("ok", "warn", "fault")
+LARGEST = 32.7
+"""Of the watchdog's figures, px, mm and mrad: what is off by more than the registers hold is a fault in any case."""
 HEARTBEAT = next(register.address for register in IDENTITY if register.name == "heartbeat")
 
 
@@ -182,6 +185,7 @@ def _finished(snapshot: Snapshot, cycle_id: int) -> Result | None:
 def _identity(snapshot: Snapshot, signals: Signals) -> Values:
     cameras = sum((camera.connected | bool(camera.error) << 1) << 2 * i for i, camera in enumerate(snapshot.cameras))
     return {"magic": 0xB1D0, "layout_version": LAYOUT_VERSION, "test_u32": 0x01020304, "test_f32": 123456.0,
+            "rig_version": snapshot.rig_version,
             "capabilities": CAPABILITIES, "max_records": PAGE_SIZE, "status": signals.status,
             "active_recipe": signals.echo.recipe, "mode": OWNERS.index(snapshot.owner), "camera_states": cameras,
             "latched_error": signals.latched}
@@ -227,7 +231,22 @@ def _diagnostics(snapshot: Snapshot) -> Values:
     values: dict[str, Number] = {name: count for name, count in snapshot.counts if name in COUNTS}
     if sync:
         values |= {"skew": abs(sync.skew_us), "skew_sigma": sync.sigma_us, "resends": sync.resends, "missing": sync.missing}
-    return values
+    return {**values, **_calibration(snapshot)}
+
+
+def _calibration(snapshot: Snapshot) -> dict[str, Number]:
+    """The watchdog's last word."""
+    seen = snapshot.drift.latest if snapshot.drift is not None else None
+    if seen is None:
+        return {}
+    figures: dict[str, float | None] = {"row_error": seen.row_px, "row_off": seen.off_px, "row_change": seen.change_px}
+    if seen.marks is not None:
+        milli = {"marks_shift": seen.marks.shift_m, "marks_turn": seen.marks.turn_rad, "depth_error": seen.marks.depth_m}
+        figures |= {name: 1000 * value for name, value in milli.items() if value is not None}
+    if seen.correction is not None:
+        figures["correction"] = 1000 * math.hypot(*seen.correction.rotation_rad)
+    return {"calibration": 1 + LEVELS.index(seen.level), "marks_seen": seen.marks.seen if seen.marks is not None else 0,
+            **{name: min(max(value, -LARGEST), LARGEST) for name, value in figures.items() if value is not None}}
 
 
 def _fill(image: list[int], table: tuple[Register, ...], values: Values, word_order: WordOrder) -> None:

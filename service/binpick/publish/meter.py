@@ -7,8 +7,10 @@ from contextlib import aclosing
 from binpick.metrics import Facts, Metrics
 from binpick.publish.events import snapshots
 from binpick.publish.ports import View
+from binpick.result import Snapshot
 
 NS_PER_S = 1e9
+LEVELS = ("ok", "warn", "fault")
 
 
 async def run(view: View, metrics: Metrics) -> None:
@@ -35,4 +37,19 @@ def facts(view: View) -> Facts:
     return Facts(refused=counts.get("refused", 0), late=counts.get("late", 0), gate_stopped=counts.get("gate_stopped", 0),
                  frame_age_s=age_s, camera_failures={camera.name: camera.failures for camera in snapshot.cameras},
                  ready=snapshot.phase == "ready",
-                 pairs_refused=max((camera.refused for camera in snapshot.cameras), default=0))
+                 pairs_refused=max((camera.refused for camera in snapshot.cameras), default=0),
+                 calibration=_calibration(snapshot))
+
+
+def _calibration(snapshot: Snapshot) -> dict[str, float]:
+    """The watchdog's last word; what could not be measured is absent."""
+    seen = snapshot.drift.latest if snapshot.drift is not None else None
+    if seen is None:
+        return {}
+    figures: dict[str, float | None] = {"level": float(LEVELS.index(seen.level)), "row_px": seen.row_px, "off_px": seen.off_px,
+                                         "change_px": seen.change_px}
+    if (marks := seen.marks) is not None:
+        figures |= {"marks_seen": float(marks.seen), "marks_shift_m": marks.shift_m, "marks_turn_rad": marks.turn_rad,
+                    "depth_error_m": marks.depth_m}
+    figures["correction_rad"] = math.hypot(*seen.correction.rotation_rad) if seen.correction is not None else 0.0
+    return {name: value for name, value in figures.items() if value is not None}

@@ -29,7 +29,9 @@ from pymodbus.pdu.register_message import (
 )
 
 from binpick import settings
-from binpick.errors import BinpickError, Code, CycleRefused, InputError, NotApplicable, PortInUse
+from binpick.calibration import SampleRequest
+from binpick.errors import BinpickError, Code, CycleRefused, FlangePoseMissing, InputError, NotApplicable, PortInUse
+from binpick.message import Verify
 from binpick.publish import handshake, image
 from binpick.publish.connection import Connection
 from binpick.publish.exchange import NO_CTRL, Abort, Acknowledge, Action, Facts, Forget, Inputs, Report, Start, Withdraw
@@ -37,7 +39,7 @@ from binpick.publish.handshake import State
 from binpick.publish.image import Signals
 from binpick.publish.ports import Control, View
 from binpick.publish.registers import HOLDING, HOLDING_WORDS, INPUT_WORDS, MIRROR, Ctrl
-from binpick.result import Snapshot
+from binpick.result import Request, Snapshot
 from binpick.settings.cell import ModbusSettings
 
 Clock: TypeAlias = Callable[[], int]
@@ -228,12 +230,22 @@ class ModbusServer:
         try:
             job = settings.resolve(self._cell, *(self._holding[AT[name]] for name in ("recipe", "bin", "tool")))
             request = image.decode_request(self._holding, job.recipe, self._settings.word_order)
-            cycle_id = self._control.start(request, "modbus")
+            cycle_id = self._begin(request, inputs.command)
         except BinpickError as error:
             log.warning("Modbus: command %d refused: %s", inputs.cmd_seq, error)
             return handshake.refused(self._state, inputs, error.code)
         deadline_ns = inputs.now_ns + (request.timeout_ms or self._cell.timeout_ms) * 1_000_000
         return handshake.started(self._state, inputs, cycle_id, image.Echo.of(request, job), deadline_ns)
+
+    def _begin(self, request: Request, command: int) -> int:
+        if command == handshake.VERIFY:
+            return self._control.verify(Verify(), request, "modbus")
+        if command != handshake.SAMPLE:
+            return self._control.start(request, "modbus")
+        if request.T_base_flange is None:
+            raise FlangePoseMissing("a calibration sample needs the flange pose: write it, and b0 of flange_flags")
+        sample = SampleRequest(recipe=request.recipe, timeout_ms=request.timeout_ms, T_base_flange=request.T_base_flange)
+        return self._control.calibration.sample(sample, "modbus")
 
     def _forget(self, inputs: Inputs) -> State:
         try:

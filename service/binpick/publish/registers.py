@@ -25,8 +25,8 @@ PAGE_SIZE = 4
 HOLDING_WORDS = 35
 INPUT_WORDS = 360
 MIRROR = 1000
-CAPABILITIES = 1 << 1 | 1 << 8 | 1 << 9
-"""Bit n: command n; 1 pick, 8 bin exchanged, 9 clear."""
+CAPABILITIES = 1 << 1 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9
+"""Bit n: command n; 1 pick, 5 verify calibration, 7 calibration sample, 8 bin exchanged, 9 clear."""
 FRAMES: tuple[FrameName, ...] = ("camera", "bin", "base")
 OWNERS = ("none", "modbus", "rest")
 
@@ -62,7 +62,11 @@ class Status(IntFlag):
 
 
 class Detail(IntEnum):
-    """Why a cycle ended as it did, beyond its return code."""
+    """Why a cycle ended as it did, beyond its return code.
+
+    Of a calibration sample, what it is worth: with code 0 more are needed, they are enough, or it shows nothing that others do
+    not; with code 110 how many cameras saw the board.
+    """
 
     NONE = 0
     SCALE_OVERFLOW = 1
@@ -72,6 +76,11 @@ class Detail(IntEnum):
     HEARTBEAT_STOPPED = 5
     CLEARED = 6
     WITHDRAWN = 7
+    SAMPLE_NEW = 8
+    SAMPLE_ENOUGH = 9
+    SAMPLE_NOT_NEW = 10
+    BOARD_SEEN_BY_SOME = 11
+    BOARD_SEEN_BY_NONE = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +121,7 @@ HOLDING = _table(
     0,
     ("ctrl", "u16", 1, "bits", "; ".join(f"b{i} {bit.name}" for i, bit in enumerate(Ctrl))
      + ". A trigger needs ENABLE = 1 and RES_ACK = 0. ROBOT_CLEAR is not evaluated in this version"),
-    ("command", "u16", 1, "", "1 pick, 8 bin exchanged: forget its memory, 9 clear errors; 2 to 7 answer -8 in this version"),
+    ("command", "u16", 1, "", "1 pick, 5 verify calibration, 7 calibration sample, 8 bin exchanged, 9 clear; others answer -8"),
     ("cmd_seq", "u16", 1, "", "Your number of this command, 1 to 65535, another one each time; write it after the arguments"),
     ("recipe", "u16", 1, "", "Recipe number; 0 the first"),
     ("tool", "u16", 1, "", "Tool number; 0 the recipe's"),
@@ -137,7 +146,7 @@ IDENTITY = _table(
     ("test_f32", "f32", 1, "", "123456.0: proves the word order"),
     ("capabilities", "u16", 1, "bits", "Bit n: command n is available"),
     ("max_records", "u16", 1, "", "Records in a page"),
-    ("spare_8", "u16", 1, "", "0"),
+    ("rig_version", "u16", 1, "", "Version of the rig in use"),
     ("spare_9", "u16", 1, "", "0"),
     ("status", "u16", 1, "bits", "; ".join(f"b{i} {bit.name}" for i, bit in enumerate(Status))),
     ("heartbeat", "u16", 1, "", "Counts up ten times a second"),
@@ -213,7 +222,16 @@ DIAGNOSTICS = _table(
     ("resends", "u32", 1, "", "Packets sent again for the last pair"),
     ("missing", "u32", 1, "", "Packets that never came for the last pair"),
     *((name, "u32", 1, "", f"{sentence}, since start") for name, sentence in COUNTS.items()),
-    *((f"spare_{n}", "u16", 1, "", "0") for n in range(346, 359)),
+    ("calibration", "u16", 1, "", "What the watchdog says: 0 nothing yet, 1 ok, 2 warning, 3 fault"),
+    ("row_error", "i16", 0.001, "px", "Rows of the right image below the left's, last cycle; -32768 unknown"),
+    ("row_off", "i16", 0.001, "px", "What counts for the watchdog's limits, over the last cycles; -32768 unknown"),
+    ("row_change", "i16", 0.001, "px", "Change of the row error over 100 cycles; -32768 unknown"),
+    ("marks_seen", "u16", 1, "", "Reference marks that both cameras saw"),
+    ("marks_shift", "u16", 0.01, "mm", "Cameras against the cell since the marks were stored"),
+    ("marks_turn", "u16", 0.01, "mrad", "Likewise"),
+    ("depth_error", "i16", 0.01, "mm", "What the marks say depth is off; -32768 unknown"),
+    ("correction", "u16", 0.001, "mrad", "Turn by which the second camera is corrected; 0 none"),
+    *((f"spare_{n}", "u16", 1, "", "0") for n in range(355, 359)),
     _CHECK,
 )
 INPUT_TABLES = (IDENTITY, HEADER, *RECORDS, BLOCK, COMPACT, DIAGNOSTICS)

@@ -12,7 +12,7 @@ from fastapi.openapi.utils import get_openapi
 import binpick
 from binpick.health import Health
 from binpick.metrics import Metrics
-from binpick.publish import cycles, meter, problems, status, wiring
+from binpick.publish import calibration, cycles, meter, problems, status, verification, wiring
 from binpick.publish.ports import Control, View
 from binpick.publish.problems import Problem
 
@@ -47,7 +47,9 @@ def _routes(lifespan: Callable[[FastAPI], Any] | None) -> FastAPI:
                   responses={"4XX": _problem("The request was refused."), "5XX": _problem("The cell cannot.")})
     problems.attach(app)
     app.include_router(cycles.router)
+    app.include_router(calibration.router)
     app.include_router(status.router)
+    app.include_router(verification.router)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

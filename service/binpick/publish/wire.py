@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from binpick.data import CameraStatus
-from binpick.message import Wire
+from binpick.message import Level, Wire
 from binpick.result import Owner, Phase, Published, Snapshot
 
 NS_PER_MS = 1_000_000
@@ -41,9 +41,13 @@ class State(Wire):
     """The published result holds."""
     withdrawn: str
     """Why it does not."""
+    rig_version: int
+    """The version of the rig that the next cycle runs on."""
     owner: Owner
     simulated: bool
     faults: tuple[str, ...]
+    calibration: Level | None
+    """What the watchdog says of the calibration; null: nobody watches it."""
     cameras: tuple[CameraStatus, ...]
     counts: dict[str, int]
 
@@ -53,8 +57,9 @@ class State(Wire):
         return cls(
             boot_id=snapshot.boot_id, phase=snapshot.phase, cycle_id=snapshot.current, acquired=snapshot.acquired,
             latest=snapshot.latest.result.cycle_id if snapshot.latest else 0, valid=snapshot.valid,
-            withdrawn=snapshot.withdrawn, owner=snapshot.owner, simulated=snapshot.simulated, faults=snapshot.faults,
-            cameras=snapshot.cameras, counts=dict(snapshot.counts))
+            withdrawn=snapshot.withdrawn, rig_version=snapshot.rig_version, owner=snapshot.owner,
+            simulated=snapshot.simulated, faults=snapshot.faults, cameras=snapshot.cameras, counts=dict(snapshot.counts),
+            calibration=snapshot.drift.level if snapshot.drift is not None else None)
 
 
 def age_ms(published: Published, now_ns: int) -> float | None:

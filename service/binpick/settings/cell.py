@@ -13,6 +13,7 @@ from binpick.settings.tool import SuctionTool, Tool
 Port = Annotated[int, Field(ge=1, le=65535)]
 PixelFormat = Literal["Mono8", "Mono10", "Mono10p", "Mono12", "Mono12p", "Mono12Packed", "BayerRG8"]
 Sync = Literal["line", "scheduled_action", "action", "software"]
+MarkFamily = Literal["apriltag_36h11", "apriltag_25h9", "apriltag_16h5", "4x4_50", "5x5_50", "6x6_50"]
 
 
 class CameraAddress(Strict):
@@ -119,6 +120,49 @@ class MemorySettings(Strict):
     """Kept as memory.json in this folder; null: lost with the process. A relative one starts where the daemon does."""
 
 
+class CalibrationSettings(Strict):
+    """Where the daemon keeps what calibrating it makes, and the board it looks for."""
+
+    directory: Path | None = None
+    """Versions of the rig, samples of a board and what the watchdog finds are kept below this folder; null: in `calibration`
+    beside the rig file. A relative one starts where the daemon does."""
+    board: Annotated[str, Field(max_length=64)] = ""
+    """The board of samples that name none, as `charuco:9x6:0.025`; "": the one that the rig was calibrated with."""
+
+
+class Watchdog(Strict):
+    """Looks at every cycle's images whether the cameras still stand to each other as they were calibrated."""
+
+    warn_px: Annotated[float, Field(ge=0.1, le=5)] = 0.3
+    """Rows of the two images this far apart, px: grasps come with return code 2, calibration warning."""
+    fault_px: Annotated[float, Field(ge=0.2, le=8)] = 1.0
+    """Rows this far apart, px: no grasps any more, return code -24."""
+    self_correct: bool = False
+    """Small turns of the second camera that rows and marks prove are taken out of the following cycles' depth; they keep return
+    code 2, and every result says so."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Watchdog":
+        if self.fault_px <= self.warn_px:
+            raise ValueError(f"fault_px is {self.fault_px:g}: it must be above warn_px, {self.warn_px:g}")
+        return self
+
+
+class ReferenceMarks(Strict):
+    """ArUco or AprilTag marks fixed to the cell, seen by both cameras; `POST /v1/calibration/verify` stores where they are."""
+
+    family: MarkFamily = "apriltag_36h11"
+    """What is printed."""
+    ids: Annotated[tuple[Annotated[int, Field(ge=0, le=1023)], ...], Field(max_length=64)] = ()
+    """The marks' numbers; empty: whatever is seen when they are stored, three or more."""
+
+    @model_validator(mode="after")
+    def _enough(self) -> "ReferenceMarks":
+        if self.ids and len(set(self.ids)) < 3:
+            raise ValueError("ids: three different marks at least, or leave it empty")
+        return self
+
+
 class Cell(Strict):
     """One robot cell. Only `bins` (or `bin`) is required."""
 
@@ -140,12 +184,24 @@ class Cell(Strict):
     """What is kept."""
     memory: MemorySettings = MemorySettings()
     """The memory of outcomes."""
+    calibration: CalibrationSettings = CalibrationSettings()
+    """Versions of the rig, and samples to calibrate from."""
+    watchdog: Watchdog = Watchdog()
+    """What is made of a calibration that drifts."""
+    reference_marks: ReferenceMarks | None = None
+    """Marks fixed to the cell: they show what rows cannot, a turn about the vertical and a mount that was pushed. null: none.
+    Where they are is kept in `calibration.directory`."""
     timeout_ms: Annotated[int, Field(ge=100, le=60000)] = 5000
     """Time limit of a cycle when the request names none, ms."""
     result_max_age_ms: Annotated[int, Field(ge=500, le=3_600_000)] = 60000
     """A result unread for longer than this is withdrawn, ms."""
     reconnect_s: Annotated[float, Field(ge=0.1, le=60)] = 2.0
     """A controller's connection lost for longer than this withdraws its result, seconds."""
+
+    @property
+    def calibration_directory(self) -> Path:
+        """Where versions of the rig and samples are kept."""
+        return self.calibration.directory or self.rig.parent / "calibration"
 
     @model_validator(mode="before")
     @classmethod

@@ -253,6 +253,13 @@ class Recipe(Strict):
         alone = {"shots": self.shots[:1], "hdr": None, "projector": bool(self.projector)}
         return self.model_copy(update=alone)
 
+    @property
+    def plain(self) -> "Recipe":
+        """With one shot alone that shows no pattern, exposed like the first such one, else like the first."""
+        shot = next((shot for shot in self.shots if shot.projector is False), self.shots[0])
+        alone = {"shots": (shot.model_copy(update={"projector": False, "pattern": 0}),), "hdr": None, "projector": False}
+        return self.model_copy(update=alone)
+
     def _light(self, shot: Shot) -> Light:
         own = min(FIRST_TRY_US, self.auto.longest_us) if self.exposure_us == "auto" else self.exposure_us
         return Light(exposure_us=own if shot.exposure_us is None else shot.exposure_us,

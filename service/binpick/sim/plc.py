@@ -91,12 +91,25 @@ class Plc:
 
         Raises NotReady with the error that the cell names, CycleTimeout when the server breaks the handshake.
         """
-        limit_s = timeout_ms / 1000 + MARGIN_S
-        await self._ready(limit_s)
-        self._cmd_seq = self._cmd_seq % 65535 + 1
+        await self._ready(timeout_ms / 1000 + MARGIN_S)
         await self._write(3, [recipe, tool, frame, max_grasps, pose_format, timeout_ms])
         await self._write(27, [bin_number])
-        await self._write(1, [1, self._cmd_seq])
+        return await self._cycle(1, timeout_ms / 1000 + MARGIN_S)
+
+    async def verify(self, *, timeout_ms: int = 5000) -> PlcResult:
+        """Has the calibration looked at (command 5): 0 it holds, 2 a warning, -24 a fault. Raises as `pick`."""
+        await self._ready(timeout_ms / 1000 + MARGIN_S)
+        await self._write(3, [0, 0, 0, 0, 0, timeout_ms])
+        return await self._cycle(5, timeout_ms / 1000 + MARGIN_S)
+
+    async def status(self) -> int:
+        """The status word, register 10."""
+        return (await self._read(10, 1))[0]
+
+    async def _cycle(self, command: int, limit_s: float) -> PlcResult:
+        """Triggers a command that takes images, with its arguments written, and reads what came of it."""
+        self._cmd_seq = self._cmd_seq % 65535 + 1
+        await self._write(1, [command, self._cmd_seq])
         await self._write(0, [ENABLE | TRIG])
         try:
             status = await self._until(ACK | NACK, limit_s)
@@ -113,20 +126,33 @@ class Plc:
 
     async def exchanged(self, *, bin_number: int = 0, timeout_ms: int = 1000) -> int:
         """Says that the bin was exchanged (command 8); returns the code of the answer. Raises NotReady, CycleTimeout."""
+        await self._write(27, [bin_number])
+        return (await self._command(8, timeout_ms))[0]
+
+    async def sample(self, T_base_flange: Transform | None, *, timeout_ms: int = 5000) -> tuple[int, int]:
+        """Has a calibration sample taken (command 7); returns code and detail. Raises NotReady, CycleTimeout."""
+        if T_base_flange is not None:
+            numbers = [*T_base_flange[:3, 3] * 1000, *Rotation.from_matrix(T_base_flange[:3, :3]).as_quat()]
+            await self._write(12, [word for number in numbers for word in self._words(float(number))])
+        await self._write(3, [0, 0, 0, 0, 1, timeout_ms])
+        await self._write(34, [int(T_base_flange is not None)])
+        return await self._command(7, timeout_ms)
+
+    async def _command(self, command: int, timeout_ms: int) -> tuple[int, int]:
+        """One command that gives no grasps, from READY until TRIG and RES_ACK have fallen again: its code and detail."""
         limit_s = timeout_ms / 1000 + MARGIN_S
         await self._ready(limit_s)
         self._cmd_seq = self._cmd_seq % 65535 + 1
-        await self._write(27, [bin_number])
-        await self._write(1, [8, self._cmd_seq])
+        await self._write(1, [command, self._cmd_seq])
         await self._write(0, [ENABLE | TRIG])
         try:
-            await self._until(VALID | NACK, limit_s)
-            code = _signed((await self._read(105, 1))[0])
+            await self._until(VALID | NACK | ERROR, limit_s)
+            code, detail = await self._read(105, 2)
             await self._write(0, [ENABLE | TRIG | RES_ACK])
             await self._until(VALID, limit_s, level=False)
         finally:
             await self._write(0, [ENABLE])
-        return code
+        return _signed(code), detail
 
     async def report(self, seq: int, grasp_id: int, outcome: int) -> None:
         """Tells what became of a grasp: 1 ok, 2 missed, 3 dropped, 4 collision, 5 skipped, 6 double, 7 unreachable."""
@@ -182,6 +208,10 @@ class Plc:
     def _float(self, first: int, second: int) -> float:
         high, low = (first, second) if self._word_order == "ABCD" else (second, first)
         return float(struct.unpack(">f", struct.pack(">HH", high, low))[0])
+
+    def _words(self, number: float) -> tuple[int, int]:
+        high, low = struct.unpack(">HH", struct.pack(">f", number))
+        return (high, low) if self._word_order == "ABCD" else (low, high)
 
     async def _until(self, bits: int, timeout_s: float, *, level: bool = True) -> int:
         """The status word as soon as any of the bits is set (or, with level False, all are clear)."""

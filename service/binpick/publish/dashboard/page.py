@@ -8,7 +8,7 @@ from pathlib import Path
 from nicegui import background_tasks, ui
 
 from binpick.health import Health
-from binpick.publish.dashboard import panels, words
+from binpick.publish.dashboard import panels, trend, views, words
 from binpick.publish.events import snapshots
 from binpick.publish.ports import View
 from binpick.result import Published, Snapshot
@@ -44,6 +44,7 @@ class Page:
                     self._panel("timings")
             with ui.element("section").classes("foot"):
                 self._panel("cameras")
+                self._panel("calibration")
                 self._panel("counts")
         self._show(self._view.snapshot())
         following = background_tasks.create(self._follow(), name="binpick-page")
@@ -68,8 +69,9 @@ class Page:
         health = self._health()
         content = {
             "banner": panels.banner(words.banner(snapshot, health), snapshot), "result": panels.result(snapshot),
-            "grasps": panels.grasps(snapshot), "funnel": panels.funnel(snapshot), "timings": panels.timings(snapshot),
-            "cameras": panels.cameras(snapshot), "counts": panels.counts(snapshot)}
+            "grasps": views.panel(snapshot) or panels.grasps(snapshot),
+            "funnel": panels.funnel(snapshot), "timings": panels.timings(snapshot),
+            "cameras": panels.cameras(snapshot), "counts": panels.counts(snapshot), "calibration": trend.panel(snapshot)}
         for name, markup in content.items():
             self._panels[name].set_content(markup)
         self._picture(snapshot)
