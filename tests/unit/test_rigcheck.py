@@ -226,6 +226,19 @@ def test_a_board_moved_by_hand_is_not_called_sharp() -> None:
     assert moved.quality.blur_px > 2
 
 
+def test_one_tag_is_a_board_and_two_are_none() -> None:
+    board = parse("apriltag:36h11:0.08")
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    image = np.full((480, 640), 210, np.uint8)
+    image[150:310, 200:360] = cv2.aruco.generateImageMarker(family, 10, 160)
+    seen = sight.find(cv2.GaussianBlur(image, None, 0.8), board)
+    assert isinstance(seen, Detection)
+    assert seen.corners_px == pytest.approx(np.array([[199.5, 149.5], [359.5, 149.5], [199.5, 309.5], [359.5, 309.5]]), abs=0.6)
+    assert not isinstance(sight.pair(seen, seen), Refusal)
+    image[20:120, 450:550] = cv2.aruco.generateImageMarker(family, 3, 100)
+    assert "or several" in sight.find(image, board).reason
+
+
 def test_what_is_no_board_is_refused_with_the_reason() -> None:
     board = parse("chessboard:9x6:0.025")
     assert "all one grey (60 to 60 of 255)" in sight.find(np.full((480, 640), 60, np.uint8), board).reason
@@ -237,7 +250,8 @@ def test_what_is_no_board_is_refused_with_the_reason() -> None:
 
 
 @pytest.mark.parametrize("spec", ["chessboard:9x6:0.025", "charuco:9x6:0.025:0.018:5x5_100", "circles:9x7:0.02",
-                                  "charuco:7x5:0.03:0.02:apriltag_36h11", "circles:9x7:0.02:0.012", "acircles:4x11:0.02:0.016"])
+                                  "charuco:7x5:0.03:0.02:apriltag_36h11", "circles:9x7:0.02:0.012", "acircles:4x11:0.02:0.016",
+                                  "apriltag:36h11:0.08"])
 def test_a_board_is_written_as_it_is_read(spec: str) -> None:
     assert str(parse(spec)) == spec
 
@@ -246,7 +260,8 @@ def test_a_board_is_written_as_it_is_read(spec: str) -> None:
     ("dots:9x6:0.02", "acircles:4x11:0.02"), ("chessboard:9x6:0.025:0.01", "no markers"),
     ("charuco:9x6:0.025:0.024", "0.2 to 0.9"), ("charuco:9x6:0.025:0.018:9x9_100", "no dictionary is called 9x9_100"),
     ("charuco:20x20:0.025:0.018:4x4_50", "4x4_50 has 50"), ("circles:9x7:0.02:0.012:5x5_100", "only a ChArUco"),
-    ("circles:2x7:0.02", "3 to 50 dots"), ("acircles:4x10:0.02", "an odd number of rows")])
+    ("circles:2x7:0.02", "3 to 50 dots"), ("acircles:4x10:0.02", "an odd number of rows"),
+    ("apriltag:36h12:0.08", "no dictionary is called apriltag_36h12"), ("apriltag:36h11:80", "in metres")])
 def test_bad_board(spec: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         parse(spec)
