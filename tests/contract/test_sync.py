@@ -115,8 +115,8 @@ def test_ptp_that_falls_back_costs_the_proof_and_no_pair(gige_addresses: tuple[s
 
 
 def test_a_ptp_that_got_stuck_is_started_anew(gige_addresses: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timekeeper, "PATIENCE_NS", 300_000_000)
-    with cell(gige_addresses) as (rig, group):
+    monkeypatch.setattr(timekeeper, "PATIENCE_NS", 2_000_000_000)
+    with cell(gige_addresses, settle_s=1.0) as (rig, group):         # so long at least there is a pair to be seen without it
         proved(group, "ptp")
         rig.ptp.enable(1, False, time.time_ns())          # though the camera's feature still says that it is on
         proved(group, "latch")
