@@ -317,6 +317,16 @@ def test_vague_and_missing_readings_count_for_nothing() -> None:
     assert len(watch.rows) == 6
 
 
+def test_what_was_read_long_ago_says_nothing_of_now() -> None:
+    dark = Rows(reason="dark")
+    assert "No drift" in after([*[CALM] * 9, *[dark] * 40]).sentence
+    gone = after([*[CALM] * 9, *[dark] * 50])
+    assert "Nothing has told in 50 cycles" in gone.sentence
+    assert np.isnan(gone.off_px)
+    warned = after([*[replace(CALM, off_px=0.5)] * 9, *[dark] * 60])
+    assert warned.level is Level.WARN, "that nothing is seen any more makes nothing better"
+
+
 def test_a_trend_is_told_before_it_warns() -> None:
     watch = after([replace(CALM, row_px=0.002 * cycle, off_px=0.002 * cycle) for cycle in range(80)])
     assert watch.level is Level.OK

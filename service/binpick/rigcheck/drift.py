@@ -14,6 +14,8 @@ KEPT = 64
 """Readings that a trend is drawn through."""
 RECENT, FEWEST = 9, 5
 """The verdict is of the median of so many of the last readings, once there are so few: no single bin warns."""
+STALE = 50
+"""Readings of so many cycles ago say nothing of now."""
 VAGUE = 0.3
 """Rows or marks are not read when their sigma is above this share of the limit that warns."""
 SURE = 2.0
@@ -94,12 +96,15 @@ def step(watch: Watch, rows: Rows | None, marks: MarksCheck | None = None, limit
 
 def _measured(watch: Watch) -> Watch:
     """With medians of the recent readings."""
-    rows, marks = ([reading for _, reading in watch.rows[-RECENT:]], [reading for _, reading in watch.marks[-RECENT:]])
+    since = watch.cycles - STALE
+    rows = [reading for cycle, reading in watch.rows[-RECENT:] if cycle > since]
+    marks = [reading for cycle, reading in watch.marks[-RECENT:] if cycle > since]
     turns = [mark.rotation_rad for mark in marks] if len(marks) >= FEWEST else [row.rotation_rad for row in rows]
     return replace(watch, row_px=_median([row.row_px for row in rows]), off_px=_median([_certain(row) for row in rows]),
                    trend_px=_trend_px(watch.rows), depth_m=_median([mark.depth_m for mark in marks]),
                    shift_m=float(np.linalg.norm(_medians([mark.shift_m for mark in marks]))),
-                   bin_m=_median([bin_.shift_m for _, bin_ in watch.carriers[-RECENT:]]), rotation_rad=_medians(turns))
+                   bin_m=_median([bin_.shift_m for cycle, bin_ in watch.carriers[-RECENT:] if cycle > since]),
+                   rotation_rad=_medians(turns))
 
 
 def _certain(rows: Rows) -> float:
@@ -138,7 +143,10 @@ def _judged(watch: Watch, limits: Limits) -> Watch:
     told = [question for question in asked if np.isfinite(question[0])]
     faults = [sentence for value, _, fault, sentence in told if value >= fault] or _sudden(watch, limits)
     if not told and not faults:
-        return replace(watch, level=Level.OK, sentence=Watch().sentence)
+        if watch.level is not Level.OK:
+            return watch            # that nothing is seen any more makes nothing better
+        return replace(watch, sentence=Watch().sentence if watch.cycles < STALE else (
+            f"Nothing has told in {STALE} cycles whether the calibration has drifted: verify it, or fix marks around the bin."))
     warnings = [sentence for value, warn, _, sentence in told if value >= warn]
     if faults:
         return replace(watch, level=Level.FAULT, sentence=_said(faults, "calibrate again"))
