@@ -168,7 +168,10 @@ def test_the_command_serves_a_cell_from_files_records_its_cycle_and_stops(tmp_pa
     cell = cell_folder(tmp_path, rest_port, modbus_port)
     with daemon("-m", "binpick", "run", "--cell", str(cell), rest_port=rest_port, clock=clock) as running:
         running.wait_for("ready")
-        assert httpx.get(f"{running.base}/v1/health").json() == {"status": "ok", "live": True, "ready": True, "reasons": []}
+        health = httpx.get(f"{running.base}/v1/health").json()
+        assert health.pop("rig").startswith("version 1, sha256 ")
+        assert any("yaw" in blind for blind in health.pop("unseen"))
+        assert health == {"status": "ok", "live": True, "ready": True, "reasons": []}
         answer = httpx.post(f"{running.base}/v1/cycles?wait=true", timeout=30)
         assert answer.json()["return_code"]["value"] == 105
         ends_well(running, signal.SIGTERM)
