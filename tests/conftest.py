@@ -4,7 +4,6 @@ import faulthandler
 import mmap
 import os
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -18,6 +17,8 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+import ports
 
 LIMIT_S = 60
 SLOW_LIMIT_S = 300
@@ -80,9 +81,8 @@ def clock() -> Iterator[Callable[[], float]]:
 @pytest.fixture
 def free_port() -> int:
     """A TCP port of 127.0.0.1 that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    [port] = ports.free(1)
+    return port
 
 
 @pytest.fixture
