@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ports
+import printed
 import staged
 from binpick import calibration, geometry, settings
 from binpick import rig as rig_file
@@ -56,23 +57,10 @@ def flange(number: int) -> Transform:
     return T_base_flange
 
 
-@cache
-def drawn() -> tuple[np.ndarray, float]:
-    """The board with its border, and how many metres a pixel of it is."""
-    board, side = boards.parse(BOARD), 40
-    sheet = board.charuco.generateImage(((board.columns + 1) * side, (board.rows + 1) * side), marginSize=0)
-    return cv2.copyMakeBorder(sheet // 255 * 190 + 20, *[side] * 4, cv2.BORDER_CONSTANT, value=210), board.square_m / side
-
-
 def seen(T_cam_board: Transform) -> np.ndarray:
     """A camera's view of the board; its first inner corner is the board's origin."""
-    sheet, metres = drawn()
-    first = 2 * 40 - 0.5
-    T_board_sheet = np.array([[metres, 0, -first * metres], [0, metres, -first * metres], [0, 0, 1]])
-    H = rig().cameras[0].K_px @ T_cam_board[:3, [0, 1, 3]] @ T_board_sheet
-    large = cv2.warpPerspective(sheet, np.array([[3, 0, 1.0], [0, 3, 1.0], [0, 0, 1]]) @ H, (SIZE[0] * 3, SIZE[1] * 3),
-                                borderValue=120)
-    return cv2.resize(cv2.GaussianBlur(large, None, 1.5), SIZE, interpolation=cv2.INTER_AREA)
+    board = boards.parse(BOARD)
+    return printed.seen(printed.charuco(board.charuco), board.square_m, rig().cameras[0].K_px, T_cam_board, SIZE, 3, 1.5)
 
 
 @cache
