@@ -4,7 +4,6 @@ import faulthandler
 import mmap
 import os
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -14,10 +13,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+import ports
+import printed
 
 LIMIT_S = 60
 SLOW_LIMIT_S = 300
@@ -80,9 +81,8 @@ def clock() -> Iterator[Callable[[], float]]:
 @pytest.fixture
 def free_port() -> int:
     """A TCP port of 127.0.0.1 that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    [port] = ports.free(1)
+    return port
 
 
 @pytest.fixture
@@ -116,22 +116,15 @@ SHOWN_AT = [(x, y, z, tilt) for (x, y, z), tilt in zip(
 
 @pytest.fixture(scope="session")
 def shown_board() -> ShownBoard:
-    """Drawn twice oversampled; the board lies on its frame's z = 0."""
-    columns, rows, square_m, side, size = 9, 6, 0.025, 40, (640, 480)
+    columns, rows, square_m, size = 9, 6, 0.025, (640, 480)
     K = np.array([[620.0, 0, 322], [0, 622, 238], [0, 0, 1]])
     T_right_left = np.eye(4)
     T_right_left[:3, :3] = Rotation.from_euler("xyz", [0.4, -1, 0.8], degrees=True).as_matrix()
     T_right_left[:3, 3] = [-0.08, 0.001, 0.002]
-    cells = np.add.outer(np.arange(-1, rows), np.arange(-1, columns)) % 2
-    sheet = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                               cv2.BORDER_CONSTANT, value=210)
-    metres = square_m / side
-    T_board_sheet = np.array([[metres, 0, (0.5 - 2 * side) * metres], [0, metres, (0.5 - 2 * side) * metres], [0, 0, 1]])
+    board = printed.chessboard(columns, rows)
 
     def draw(T_camera_board: np.ndarray) -> np.ndarray:
-        H = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]) @ K @ T_camera_board[:3, [0, 1, 3]] @ T_board_sheet
-        large = cv2.warpPerspective(sheet, H, (size[0] * 2, size[1] * 2), flags=cv2.INTER_AREA, borderValue=120)
-        return cv2.resize(cv2.GaussianBlur(large, None, 1.5), size, interpolation=cv2.INTER_AREA)
+        return printed.seen(board, square_m, K, T_camera_board, size, 2, 1.5)
 
     pairs = []
     for x, y, z, tilt in SHOWN_AT:

@@ -1,10 +1,6 @@
 """Calibrating in the running cell, over REST and Modbus: cameras that see a drawn board where a robot holds it."""
 
 import asyncio
-import contextlib
-import socket
-import threading
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -16,28 +12,29 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 from scipy.spatial.transform import Rotation
 
-from binpick import calibration, geometry, health, settings
+import ports
+import printed
+import staged
+from binpick import calibration, geometry, settings
 from binpick import rig as rig_file
 from binpick.cell import Cell
 from binpick.cycle import CycleInput, CycleResult
-from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
+from binpick.data import Image, Light, frozen
 from binpick.errors import Busy, Code, NotInControl, RigError
 from binpick.geometry import Transform
-from binpick.publish import rest
-from binpick.publish.modbus import ModbusServer
 from binpick.result import PoseMessage, Request, Result, ReturnCode
 from binpick.rig import Rig
 from binpick.rigcheck import board as boards
 from binpick.settings import Bin, Pose, Recipe
 from binpick.settings.cell import ModbusSettings
 from binpick.sim.plc import Plc
+from servers import START_S, RestServer, with_modbus
 
 BOARD = "charuco:6x4:0.03"
 SIZE = (480, 320)
-K = ((500.0, 0.0, 240.0), (0.0, 500.0, 160.0), (0.0, 0.0, 1.0))
+FOCAL_PX = 500.0
 BASELINE_M = 0.08
 T_BASE_RIG = geometry.make(Rotation.from_euler("xyz", [175, 4, 30], degrees=True).as_matrix(), np.array([0.4, -0.1, 0.9]))
 T_FLANGE_BOARD = geometry.make(Rotation.from_euler("xyz", [3, -4, 80], degrees=True).as_matrix(), np.array([-0.06, 0.05, 0.12]))
@@ -46,11 +43,7 @@ TURNS_DEG = [(0, 0, 0), (22, 0, 5), (-20, 6, 0), (0, 24, -8), (4, -22, 30), (18,
 
 
 def rig(**changes: object) -> Rig:
-    eye = np.eye(4).tolist()
-    right = geometry.translation(-BASELINE_M, 0.0, 0.0).tolist()
-    return Rig.model_validate({"image_size_px": SIZE, "cameras": [
-        {"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T} for name, T in (("left", eye), ("right", right))],
-        "quality": {"rms_px": 0.1, "row_error_px": 0.05}, **changes})
+    return staged.rig(SIZE, FOCAL_PX, BASELINE_M, **{"quality": {"rms_px": 0.1, "row_error_px": 0.05}, **changes})
 
 
 def flange(number: int) -> Transform:
@@ -64,23 +57,10 @@ def flange(number: int) -> Transform:
     return T_base_flange
 
 
-@cache
-def drawn() -> tuple[np.ndarray, float]:
-    """The board with its border, and how many metres a pixel of it is."""
-    board, side = boards.parse(BOARD), 40
-    sheet = board.charuco.generateImage(((board.columns + 1) * side, (board.rows + 1) * side), marginSize=0)
-    return cv2.copyMakeBorder(sheet // 255 * 190 + 20, *[side] * 4, cv2.BORDER_CONSTANT, value=210), board.square_m / side
-
-
 def seen(T_cam_board: Transform) -> np.ndarray:
     """A camera's view of the board; its first inner corner is the board's origin."""
-    sheet, metres = drawn()
-    first = 2 * 40 - 0.5
-    T_board_sheet = np.array([[metres, 0, -first * metres], [0, metres, -first * metres], [0, 0, 1]])
-    H = np.array(K) @ T_cam_board[:3, [0, 1, 3]] @ T_board_sheet
-    large = cv2.warpPerspective(sheet, np.array([[3, 0, 1.0], [0, 3, 1.0], [0, 0, 1]]) @ H, (SIZE[0] * 3, SIZE[1] * 3),
-                                borderValue=120)
-    return cv2.resize(cv2.GaussianBlur(large, None, 1.5), SIZE, interpolation=cv2.INTER_AREA)
+    board = boards.parse(BOARD)
+    return printed.seen(printed.charuco(board.charuco), board.square_m, rig().cameras[0].K_px, T_cam_board, SIZE, 3, 1.5)
 
 
 @cache
@@ -95,8 +75,8 @@ def pictures(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass
-class StandCameras:
-    """Cameras that see the board at the robot's `stand`; `gate` holds a capture, `covered` hides it from the right one.
+class StandCameras(staged.Cameras):
+    """Cameras that see the board at the robot's `stand`; `covered` hides it from the right one.
 
     With `usual_us` an image is as bright as it was exposed.
     """
@@ -104,40 +84,16 @@ class StandCameras:
     stand: int = -1
     covered: bool = False
     usual_us: float = 0.0
-    opened: bool = False
     lights: list[Light] = field(default_factory=list)
-    gate: threading.Event = field(default_factory=threading.Event)
 
-    def open(self, deadline_ns: int) -> None:
-        self.opened = True
-
-    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
+    def images(self, light: Light) -> tuple[Image, Image]:
         self.lights.append(light)
-        now_ns = time.monotonic_ns()
-        self.gate.wait()
         left, right = pictures(self.stand)
-        images = (left, pictures(-1)[0] if self.covered else right)
+        images = left, pictures(-1)[0] if self.covered else right
         if self.usual_us:
-            images = tuple(cv2.convertScaleAbs(image, alpha=light.exposure_us / self.usual_us) for image in images)
-        frames = [Frame(image, name, 1, 1, now_ns, now_ns, now_ns + 1, light.exposure_us, light.gain_db)
-                  for name, image in zip(("left", "right"), images, strict=True)]
-        return StereoPair(frames[0], frames[1], "2026-01-02T03:04:05.678Z", 0.0, 0.0, "simulated")
-
-    def close(self) -> None:
-        self.opened = False
-
-    def watch(self) -> bool:
-        return False
-
-    def statuses(self) -> tuple[CameraStatus, ...]:
-        return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
-
-
-class Server(uvicorn.Server):
-    """Leaves the process's signals alone."""
-
-    def capture_signals(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
+            left, right = (cv2.convertScaleAbs(image, alpha=light.exposure_us / self.usual_us) for image in images)
+            return left, right
+        return images
 
 
 @dataclass
@@ -183,21 +139,16 @@ async def site(port: int, folder: Path, given: Rig | None = None, *, hold: bool 
         return CycleResult(Result(cycle_id=inputs.cycle_id, request=inputs.request, captured_at=inputs.pair.captured_at,
                                   return_code=ReturnCode.of(Code.BIN_EMPTY), bin=None))
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        modbus = ModbusSettings(host="127.0.0.1", port=probe.getsockname()[1])
+    modbus = ModbusSettings(host="127.0.0.1", port=ports.free(1)[0])
     configured = settings.Cell.model_validate({
         "bins": [Bin(inner_size_m=(0.3, 0.2, 0.1), pose=Pose(position_m=(0, 0, 0.6)))], "recipes": [Recipe(frame="camera")],
         "control": control, "rig": folder / "rig.json", "publish": {"modbus": modbus}, "timeout_ms": 20000, **changes})
     living = Cell(configured, given or rig(), cameras, run, boot_id=7)
-    api = rest.create_app(living, living, health=lambda: health.judge(living.snapshot()))
-    server = Server(uvicorn.Config(api, port=port, log_level="error", timeout_graceful_shutdown=2))
-    registers = ModbusServer(living, living, modbus, configured)
-    async with living:
-        await registers.start()
+    server = RestServer(living, port)
+    async with with_modbus(living, configured):
         serving = asyncio.create_task(server.serve())
         try:
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(START_S):
                 while not (server.started and living.snapshot().phase == "ready"):
                     await asyncio.sleep(0.005)
             async with (httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}", timeout=50) as client,
@@ -207,7 +158,6 @@ async def site(port: int, folder: Path, given: Rig | None = None, *, hold: bool 
             cameras.gate.set()
             server.should_exit = True
             await serving
-            await registers.stop()
 
 
 def holds(scenario: Callable[[], Any]) -> None:

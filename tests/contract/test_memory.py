@@ -4,56 +4,39 @@ The pipeline is the real one; the cameras show one picture, of two blocks, until
 """
 
 import asyncio
-import contextlib
 import json
 import os
 import signal
-import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
-from binpick import geometry, health, pipeline, recording, settings
+import staged
+from binpick import geometry, pipeline, recording, settings
 from binpick.cell import Cell
 from binpick.cell.store import DAMAGED, NAME, Store
-from binpick.data import CameraStatus, Frame, Image, Light, StereoPair
+from binpick.data import Image, Light
 from binpick.errors import Busy, Code, InputError, NotInControl, UnknownItem
 from binpick.outcomes import Attempt, Grid, Memory
-from binpick.publish import rest
-from binpick.publish.modbus import ModbusServer
 from binpick.result import Request
-from binpick.rig import Rig
-from binpick.settings.cell import ModbusSettings
 from binpick.sim import exam
 from binpick.sim.plc import Plc, PlcResult
 from binpick.sim.render import Renderer
 from binpick.sim.world import ScenePart, WorldScene
+from servers import START_S, on_a_thread, recorder, until, with_modbus
 
 OK, MISSED, SKIPPED = 1, 2, 5
 SPOT_M = 0.010
 BLOCKS = (geometry.translation(0.0, 0.0, 0.0075), geometry.translation(0.08, 0.03, 0.0075))
 
 
-def small() -> Rig:
-    """The exam's rig with 2 for 3 pixels."""
-    document = exam.rig("B").model_dump(exclude={"sha256"})
-    document["image_size_px"] = tuple(int(side / 1.5) for side in exam.IMAGE_SIZE_PX)
-    for camera in document["cameras"]:
-        K = np.array(camera["K"]) / [[1.5], [1.5], [1.0]]
-        K[:2, 2] -= 1 / 6     # pixel centres are whole numbers
-        camera["K"] = K.tolist()
-    return Rig.model_validate(document)
-
-
-RIG = small()
+RIG = staged.small_exam_rig()
 
 
 @pytest.fixture(scope="module")
@@ -75,31 +58,13 @@ def two_blocks(pictures: Callable[..., tuple[Image, Image]]) -> tuple[Image, Ima
 
 
 @dataclass
-class Showing:
-    """Cameras that show `images`."""
+class Showing(staged.Cameras):
+    """They see what is `shown`."""
 
-    images: tuple[Image, Image]
-    opened: bool = False
-    gate: threading.Event = field(default_factory=threading.Event)
+    shown: tuple[Image, Image]
 
-    def open(self, deadline_ns: int) -> None:
-        self.opened = True
-
-    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
-        now = time.monotonic_ns()
-        self.gate.wait()
-        left, right = (Frame(image, name, 1, 1, now, now, now + 1, light.exposure_us, light.gain_db)
-                       for name, image in zip(("left", "right"), self.images, strict=True))
-        return StereoPair(left, right, datetime.now(UTC).isoformat(), 0.0, 0.0, "simulated")
-
-    def close(self) -> None:
-        self.opened = False
-
-    def watch(self) -> bool:
-        return False
-
-    def statuses(self) -> tuple[CameraStatus, ...]:
-        return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
+    def images(self, light: Light) -> tuple[Image, Image]:
+        return self.shown
 
 
 def showing(images: tuple[Image, Image]) -> Showing:
@@ -117,15 +82,9 @@ def configured(port: int, folder: Path | None, **changes: object) -> settings.Ce
 async def controlled(port: int, cameras: Showing, folder: Path | None = None,
                      **changes: object) -> AsyncIterator[tuple[Cell, Plc]]:
     cell_settings = configured(port, folder, **changes)
-    modbus = ModbusSettings(host="127.0.0.1", port=port)
-    async with Cell(cell_settings, RIG, cameras, boot_id=77) as cell:
-        server = ModbusServer(cell, cell, modbus, cell_settings)
-        await server.start()
-        try:
-            async with Plc("127.0.0.1", port) as plc:
-                yield cell, plc
-        finally:
-            await server.stop()
+    cell = Cell(cell_settings, RIG, cameras, boot_id=77)
+    async with with_modbus(cell, cell_settings), Plc("127.0.0.1", port) as plc:
+        yield cell, plc
 
 
 def spots(result: PlcResult) -> np.ndarray:
@@ -181,7 +140,7 @@ def test_a_pick_nobody_speaks_of_is_verified_by_the_next_look(
             await look(plc)
             assert verdicts() == []                                  # nobody is known to pick here
             picked = int(np.linalg.norm(spots(first)[0][:2] - BLOCKS[0][:2, 3]) > 0.03)
-            cameras.images = pictures(BLOCKS[1 - picked])
+            cameras.shown = pictures(BLOCKS[1 - picked])
             third = await look(plc)
             assert verdicts() == ["cycle 2 grasp 1: outcome 1 by the cameras"]
             fourth = await look(plc)
@@ -245,39 +204,14 @@ def test_no_bin_is_exchanged_under_a_running_cycle(two_blocks: tuple[Image, Imag
     asyncio.run(scenario())
 
 
-class Server(uvicorn.Server):
-    """Leaves the process's signals alone."""
-
-    def capture_signals(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-
-@contextlib.contextmanager
+@contextmanager
 def serving(port: int, images: tuple[Image, Image], folder: Path | None = None,
             recordings: Path | None = None) -> Iterator[tuple[httpx.Client, Cell]]:
-    recorder = recording.Recorder(recordings) if recordings is not None else None
-    if recorder is not None:
-        recorder.start()
-    cell = Cell(configured(port, folder, control="rest"), RIG, showing(images), boot_id=7, recorder=recorder)
-    api = rest.create_app(cell, cell, health=lambda: health.judge(cell.snapshot()))
-    server = Server(uvicorn.Config(api, port=port, log_level="error", timeout_graceful_shutdown=2))
-
-    async def live() -> None:
-        async with cell:
-            await server.serve()
-
-    thread = threading.Thread(target=asyncio.run, args=(live(),))
-    thread.start()
-    try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=20) as client:
-            while not server.started or cell.snapshot().phase != "ready":
-                time.sleep(0.005)
+    with recorder(recordings) as recording_it:
+        cell = Cell(configured(port, folder, control="rest"), RIG, showing(images), boot_id=7, recorder=recording_it)
+        with on_a_thread(cell, cell, port) as client:
+            until(lambda: cell.snapshot().phase == "ready", START_S)
             yield client, cell
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        if recorder is not None:
-            assert recorder.close(10.0)
 
 
 def test_outcomes_told_over_rest_are_remembered_and_recorded(
@@ -322,9 +256,7 @@ def test_a_disk_that_refuses_is_an_alarm_and_the_cell_goes_on(
         folder.rmdir()
         folder.write_text("in the way")
         assert client.post(f"/v1/cycles/1/grasps/{grasps[0]['id']}/outcome", json={"code": MISSED}).status_code == 204
-        deadline = time.monotonic() + 5
-        while not cell.snapshot().faults and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until(lambda: cell.snapshot().faults)
         assert "will not survive a restart" in cell.snapshot().faults[0]
         assert client.post("/v1/cycles?wait=true", json={"frame": "bin"}).json()["return_code"]["value"] == 0
 

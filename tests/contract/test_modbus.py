@@ -2,11 +2,10 @@
 
 import asyncio
 import struct
-import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -14,58 +13,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import staged
 from binpick import settings
 from binpick.cell import Cell
 from binpick.cycle import CycleInput, CycleResult
-from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
 from binpick.errors import Code, NotReady, PortInUse
 from binpick.publish.modbus import ModbusServer
 from binpick.result import BinMessage, GraspMessage, PoseMessage, Result, ReturnCode, Sigma, ToolMessage
-from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.settings.cell import ModbusSettings
 from binpick.sim.plc import Plc
+from servers import with_modbus
 
 QUATERNION = (0.5, -0.5, 0.5, 0.5)
 ENABLE, TRIG, RES_ACK, CLEAR_ERR = 1, 2, 4, 16
 READY, ACK, NACK, BUSY, ACQ_DONE, VALID, ERROR, SIM = 1, 2, 4, 8, 16, 32, 64, 2048
-
-
-@dataclass
-class GatedCameras:
-    """Two simulated cameras whose capture waits for `gate`."""
-
-    gate: threading.Event = field(default_factory=threading.Event)
-    opened: bool = False
-
-    def open(self, deadline_ns: int) -> None:
-        self.opened = True
-
-    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
-        now = time.monotonic_ns()
-        self.gate.wait()
-        left, right = (Frame(frozen(np.zeros((24, 32), np.uint8)), name, 1, 1, now, now, now, light.exposure_us, light.gain_db)
-                       for name in ("left", "right"))
-        return StereoPair(left, right, "2026-01-02T03:04:05.678Z", 0.0, 0.0, "simulated")
-
-    def close(self) -> None:
-        self.opened = False
-
-    def watch(self) -> bool:
-        return False
-
-    def statuses(self) -> tuple[CameraStatus, ...]:
-        return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
-
-
-def rig() -> Rig:
-    eye = np.eye(4).tolist()
-    right = np.eye(4)
-    right[0, 3] = -0.15
-    K = [[100.0, 0.0, 16.0], [0.0, 100.0, 12.0], [0.0, 0.0, 1.0]]
-    return Rig.model_validate({"image_size_px": (32, 24), "T_base_rig": eye, "cameras": [
-        {"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
-        for name, T in (("left", eye), ("right", right.tolist()))]})
 
 
 def grasps(inputs: CycleInput) -> tuple[GraspMessage, ...]:
@@ -124,8 +86,7 @@ class Site:
     """A cell with its server, and the way to it."""
 
     cell: Cell
-    server: ModbusServer
-    cameras: GatedCameras
+    cameras: staged.Cameras
     port: int
 
     @asynccontextmanager
@@ -141,21 +102,19 @@ class Site:
 @asynccontextmanager
 async def site(port: int, *, word_order: Literal["ABCD", "CDAB"] = "ABCD", gated: bool = False,
                **changes: object) -> AsyncIterator[Site]:
-    cameras = GatedCameras()
+    cameras = staged.Cameras()
     if not gated:
         cameras.gate.set()
     modbus = ModbusSettings(host="127.0.0.1", port=port, word_order=word_order)
     configured = settings.Cell.model_validate({
         "bins": [Bin(inner_size_m=(0.6, 0.4, 0.18), pose=Pose(position_m=(0, 0, 1)))], "reconnect_s": 0.3,
         "recipes": [Recipe(), Recipe(number=7, pose_format="kuka_abc_deg")], "publish": {"modbus": modbus}, **changes})
-    async with Cell(configured, rig(), cameras, run, boot_id=77) as cell:
-        server = ModbusServer(cell, cell, modbus, configured)
-        await server.start()
+    cell = Cell(configured, staged.rig(T_base_rig=np.eye(4).tolist()), cameras, run, boot_id=77)
+    async with with_modbus(cell, configured):
         try:
-            yield Site(cell, server, cameras, port)
+            yield Site(cell, cameras, port)
         finally:
             cameras.gate.set()
-            await server.stop()
 
 
 def holds(scenario: Callable[[], object]) -> None:

@@ -1,71 +1,55 @@
 """REST as a client sees it: a real server on a free port over a real cell, whose cameras do what the test says."""
 
-import asyncio
-import contextlib
 import json
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 import schemathesis
-import uvicorn
 from hypothesis import HealthCheck, given, seed
 from hypothesis import settings as examples
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
-from binpick import health, settings
+import staged
+from binpick import settings
 from binpick.cell import Cell
 from binpick.cycle import CycleInput, CycleResult
-from binpick.data import CameraStatus, Frame, Light, StereoPair, frozen
+from binpick.data import CameraStatus, Image, Light
 from binpick.errors import CameraLost, Code
 from binpick.publish import rest
 from binpick.result import GraspMessage, PoseMessage, Result, ReturnCode, Sigma, ToolMessage
-from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
+from servers import on_a_thread, until
 
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 ARTEFACTS = ("cloud.ply", "overlay.png", "disparity.png", "confidence.png", "left.png", "right.png")
 
 
 @dataclass
-class StagedCameras:
-    """`gate` holds a capture; `broken` makes it fail."""
+class MortalCameras(staged.Cameras):
+    """While they are `broken`, opening and capturing fail."""
 
     broken: bool = False
-    opened: bool = False
-    gate: threading.Event = field(default_factory=threading.Event)
 
     def open(self, deadline_ns: int) -> None:
         if self.broken:
             raise CameraLost("camera left is dead", "left")
-        self.opened = True
+        super().open(deadline_ns)
 
-    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
-        now_ns = time.monotonic_ns()
-        self.gate.wait()
+    def images(self, light: Light) -> tuple[Image, Image]:
         if self.broken:
             self.opened = False
             raise CameraLost("camera left is dead", "left")
-        frames = [Frame(frozen(np.zeros((24, 32), np.uint8)), name, 1, 1, now_ns, now_ns, now_ns + 1, light.exposure_us,
-                        light.gain_db) for name in ("left", "right")]
-        return StereoPair(frames[0], frames[1], "2026-01-02T03:04:05.678Z", 0.0, 0.0, "simulated")
-
-    def close(self) -> None:
-        self.opened = False
-
-    def watch(self) -> bool:
-        return False
+        return super().images(light)
 
     def statuses(self) -> tuple[CameraStatus, ...]:
-        return tuple(CameraStatus(name, self.opened, failures=int(self.broken), simulated=True,
-                                  error="dead" if self.broken and name == "left" else "") for name in ("left", "right"))
+        return tuple(replace(status, failures=int(self.broken), error="dead" if self.broken and status.name == "left" else "")
+                     for status in super().statuses())
 
 
 def one_grasp(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
@@ -85,70 +69,40 @@ def empty(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
                               simulated=inputs.simulated, return_code=ReturnCode.of(Code.BIN_EMPTY), bin=None))
 
 
-class Server(uvicorn.Server):
-    """Leaves the process's signals alone."""
-
-    def capture_signals(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-
 @dataclass
 class Served:
     """A cell with its REST server on a thread of its own."""
 
     client: httpx.Client
-    cameras: StagedCameras
+    cameras: MortalCameras
     cell: Cell
     stop: Callable[[], None]
 
     def post(self, wait: bool = True, **body: object) -> httpx.Response:
         return self.client.post("/v1/cycles", params={"wait": wait}, json=body)
 
-    def until(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 5
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-
 
 @contextmanager
 def serving(port: int, run: Callable[[CycleInput, Callable[[], None]], CycleResult] = one_grasp, *, broken: bool = False,
             hold: bool = False, **changes: object) -> Iterator[Served]:
-    cameras = StagedCameras(broken=broken)
+    cameras = MortalCameras(broken=broken)
     if not hold:
         cameras.gate.set()
     document: dict[str, object] = {
         "bins": [Bin(inner_size_m=(0.6, 0.4, 0.18), pose=Pose(position_m=(0, 0, 1)))],
         "recipes": [Recipe(frame="camera")], "control": "rest"}
-    rig = Rig.model_validate({"image_size_px": (32, 24), "cameras": [
-        {"name": name, "K": ((100.0, 0, 16.0), (0, 100.0, 12.0), (0, 0, 1.0)), "distortion": (0, 0, 0, 0),
-         "T_cam_rig": ((1.0, 0, 0, x), *EYE[1:])} for name, x in (("left", 0.0), ("right", -0.15))]})
-    cell = Cell(settings.Cell.model_validate(document | changes), rig, cameras, run, boot_id=7)
-    app = rest.create_app(cell, cell, health=lambda: health.judge(cell.snapshot()))
-    server = Server(uvicorn.Config(app, port=port, log_level="error", timeout_graceful_shutdown=2))
-    loops: list[asyncio.AbstractEventLoop] = []
-
-    async def live() -> None:
-        loops.append(asyncio.get_running_loop())
-        async with cell:
-            await server.serve()
+    cell = Cell(settings.Cell.model_validate(document | changes), staged.rig(), cameras, run, boot_id=7)
 
     def stop() -> None:
         cameras.gate.set()
         cell.stop()
-        server.should_exit = True
 
-    thread = threading.Thread(target=asyncio.run, args=(live(),), name="binpick-test-server")
-    thread.start()
-    try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=10) as client:
-            served = Served(client, cameras, cell, stop)
-            served.until(lambda: server.started and (broken or cell.snapshot().phase == "ready"))
-            yield served
-    finally:
-        stop()
-        thread.join(5)
-        assert not thread.is_alive()
+    with on_a_thread(cell, cell, port) as client:
+        try:
+            until(lambda: broken or cell.snapshot().phase == "ready")
+            yield Served(client, cameras, cell, stop)
+        finally:
+            stop()
 
 
 def problem(response: httpx.Response, status: int, code: Code) -> dict[str, Any]:
@@ -191,7 +145,7 @@ def test_a_cycle_is_found_at_its_location_and_a_second_is_refused_at_once(free_p
         assert served.client.get(where).status_code == 202
         assert "cycle 1" in problem(served.post(), 409, Code.BUSY)["detail"]
         served.cameras.gate.set()
-        served.until(lambda: served.client.get(where).status_code == 200)
+        until(lambda: served.client.get(where).status_code == 200)
         assert served.client.get("/v1/cycles/latest").json()["cycle_id"] == 1
 
 
@@ -229,7 +183,7 @@ def test_a_failed_cycle_is_a_problem_to_who_waits_and_a_result_to_who_reads(free
         served.post(wait=False)
         served.cameras.broken = True
         served.cameras.gate.set()
-        served.until(lambda: served.cell.finished(1) is not None)
+        until(lambda: served.cell.finished(1) is not None)
         record = served.client.get("/v1/cycles/1")
         assert (record.status_code, record.json()["return_code"]["name"], record.json()["grasps"]) == (200, "cameras", [])
         assert record.json()["age_ms"] is None
@@ -240,12 +194,12 @@ def test_a_waiting_client_hears_of_time_limit_and_abort(free_port: int) -> None:
     with serving(free_port, hold=True) as served:
         assert problem(served.post(timeout_ms=100), 504, Code.TIMEOUT)["cycle_id"] == 1
         served.cameras.gate.set()
-        served.until(lambda: served.cell.snapshot().phase == "ready")
+        until(lambda: served.cell.snapshot().phase == "ready")
         served.cameras.gate.clear()
         answers: list[httpx.Response] = []
         waiting = threading.Thread(target=lambda: answers.append(served.post()), name="binpick-test-waiter")
         waiting.start()
-        served.until(lambda: served.cell.snapshot().current == 2)
+        until(lambda: served.cell.snapshot().current == 2)
         assert served.client.delete("/v1/cycles/2").status_code == 204
         waiting.join(5)
         assert problem(answers[0], 409, Code.ABORTED)["cycle_id"] == 2
@@ -254,7 +208,7 @@ def test_a_waiting_client_hears_of_time_limit_and_abort(free_port: int) -> None:
 def test_poses_that_were_taken_back_are_gone(free_port: int) -> None:
     with serving(free_port, result_max_age_ms=500) as served:
         assert served.post().status_code == 200
-        served.until(lambda: not served.cell.snapshot().valid)
+        until(lambda: not served.cell.snapshot().valid)
         for where in ("/v1/cycles/latest", "/v1/cycles/1"):
             assert "older than 500 ms" in problem(served.client.get(where), 410, Code.NOT_APPLICABLE)["detail"]
         record = served.client.get("/v1/cycles/1", params={"record": True})
@@ -275,7 +229,7 @@ def test_what_the_controller_has_read_stays_readable(free_port: int) -> None:
 def test_answers_without_poses_are_never_gone(free_port: int) -> None:
     with serving(free_port, empty, result_max_age_ms=500) as served:
         assert served.post().json()["return_code"]["value"] == Code.BIN_EMPTY
-        served.until(lambda: not served.cell.snapshot().valid)
+        until(lambda: not served.cell.snapshot().valid)
         assert served.client.get("/v1/cycles/latest").status_code == 200
 
 
@@ -305,9 +259,9 @@ def test_health_names_the_camera_that_is_down(free_port: int) -> None:
         assert served.client.get("/v1/health/live").status_code == 200
         assert served.client.get("/v1/health/ready").status_code == 503
         assert served.client.get("/v1/health").json()["reasons"][0] == "camera left is down: dead"
-        served.until(lambda: served.client.get("/v1/cameras").json()[0]["error"] == "dead")
+        until(lambda: served.client.get("/v1/cameras").json()[0]["error"] == "dead")
         served.cameras.broken = False
-        served.until(lambda: served.client.get("/v1/health/ready").status_code == 200)
+        until(lambda: served.client.get("/v1/health/ready").status_code == 200)
 
 
 def test_metrics_count_every_cycle_by_code(free_port: int) -> None:
@@ -316,7 +270,7 @@ def test_metrics_count_every_cycle_by_code(free_port: int) -> None:
         served.post()
         served.post()
         served.post(timeout_ms=1)  # may or may not be in time: it is counted under its code either way
-        served.until(lambda: _cycles(served.client.get("/metrics").text) == 3)
+        until(lambda: _cycles(served.client.get("/metrics").text) == 3)
         text = served.client.get("/metrics").text
         assert 'binpick_stage_seconds_count{stage="total"}' in text
         assert "binpick_refused_total 0.0" in text
@@ -353,7 +307,7 @@ def test_a_waiting_client_is_let_go_when_the_cell_stops(free_port: int) -> None:
         answers: list[httpx.Response] = []
         waiting = threading.Thread(target=lambda: answers.append(served.post()), name="binpick-test-waiter")
         waiting.start()
-        served.until(lambda: served.cell.snapshot().current == 1)
+        until(lambda: served.cell.snapshot().current == 1)
         served.cell.stop()
         waiting.join(5)
         problem(answers[0], 409, Code.ABORTED)

@@ -4,15 +4,10 @@ The pipeline is the real one. The cameras show one picture; the right one is mov
 """
 
 import asyncio
-import contextlib
 import json
-import socket
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +15,24 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
-from binpick import geometry, health, pipeline, recording, settings
+import ports
+import staged
+from binpick import geometry, pipeline, recording, settings
 from binpick.cell import Cell
 from binpick.cell.logbook import DAMAGED, NAME
-from binpick.data import CameraStatus, Frame, Image, Light, StereoPair, frozen
+from binpick.data import Image, Light, frozen
 from binpick.errors import Code, InputError, NotInControl
 from binpick.message import Verify
-from binpick.publish import rest
-from binpick.publish.modbus import ModbusServer
 from binpick.publish.registers import Status
 from binpick.result import Request
-from binpick.rig import Rig
-from binpick.settings.cell import ModbusSettings
 from binpick.sim import exam
 from binpick.sim.drift import NONE, Drift
 from binpick.sim.marks import Mark, layout
 from binpick.sim.plc import Plc, PlcResult
 from binpick.sim.render import Renderer
 from binpick.sim.world import ScenePart, WorldScene
+from servers import START_S, on_a_thread, recorder, until, with_modbus
 
 Pictures = list[tuple[Image, Image]]
 
@@ -51,18 +44,7 @@ CALIBRATION, ROW_ERROR = 346, 347
 """Registers."""
 
 
-def small() -> Rig:
-    """The exam's rig with 2 for 3 pixels."""
-    document = exam.rig("B").model_dump(exclude={"sha256"})
-    document["image_size_px"] = tuple(int(side / 1.5) for side in exam.IMAGE_SIZE_PX)
-    for camera in document["cameras"]:
-        K = np.array(camera["K"]) / [[1.5], [1.5], [1.0]]
-        K[:2, 2] -= 1 / 6     # pixel centres are whole numbers
-        camera["K"] = K.tolist()
-    return Rig.model_validate(document)
-
-
-RIG = small()
+RIG = staged.small_exam_rig()
 
 
 def photographed(drifted: Drift = NONE, marks: tuple[Mark, ...] = (), shots: int = 3) -> Pictures:
@@ -92,42 +74,15 @@ def lowered(image: Image, rows_px: float) -> Image:
 
 
 @dataclass
-class Drifting:
+class Drifting(staged.Cameras):
     """Cameras of which the right one's picture is moved down by `rows_px`."""
 
     pictures: Pictures
     rows_px: float = 0.0
-    opened: bool = False
-    shots: int = 0
-    gate: threading.Event = field(default_factory=threading.Event)
 
-    def open(self, deadline_ns: int) -> None:
-        self.opened = True
-
-    def capture(self, light: Light, deadline_ns: int) -> StereoPair:
-        now = time.monotonic_ns()
-        self.gate.wait()
-        left, right = self.pictures[self.shots % len(self.pictures)]
-        self.shots += 1
-        left, right = (Frame(image, name, self.shots, self.shots, now, now, now + 1, light.exposure_us, light.gain_db)
-                       for image, name in ((left, "left"), (lowered(right, self.rows_px), "right")))
-        return StereoPair(left, right, datetime.now(UTC).isoformat(), 0.0, 0.0, "simulated")
-
-    def close(self) -> None:
-        self.opened = False
-
-    def watch(self) -> bool:
-        return False
-
-    def statuses(self) -> tuple[CameraStatus, ...]:
-        return tuple(CameraStatus(name, self.opened, simulated=True) for name in ("left", "right"))
-
-
-class Server(uvicorn.Server):
-    """Leaves the process's signals alone."""
-
-    def capture_signals(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
+    def images(self, light: Light) -> tuple[Image, Image]:
+        left, right = self.pictures[(self.shots - 1) % len(self.pictures)]
+        return left, lowered(right, self.rows_px)
 
 
 @dataclass
@@ -167,50 +122,19 @@ class Daemon:
         return asyncio.run(talk())
 
 
-def other_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @contextmanager
 def daemon(port: int, pictures: Pictures, folder: Path, recordings: Path | None = None,
            rows_px: float = 0.0, **changes: object) -> Iterator[Daemon]:
-    modbus_port = other_port()
-    modbus = ModbusSettings(host="127.0.0.1", port=modbus_port)
+    [modbus_port] = ports.free(1)
     cameras = Drifting(pictures, rows_px)
     cameras.gate.set()
-    recorder = recording.Recorder(recordings) if recordings is not None else None
-    if recorder is not None:
-        recorder.start()
-    document: dict[str, Any] = {"control": "rest"} | changes
-    configured = exam.cell("B", calibration={"directory": folder}, publish={"modbus": modbus.model_dump()}, timeout_ms=30_000,
-                           **document)
-    cell = Cell(configured, RIG, cameras, boot_id=7, recorder=recorder)
-    api = rest.create_app(cell, cell, health=lambda: health.judge(cell.snapshot()))
-    server = Server(uvicorn.Config(api, port=port, log_level="error", timeout_graceful_shutdown=2))
-
-    async def live() -> None:
-        async with cell:
-            registers = ModbusServer(cell, cell, modbus, configured)
-            await registers.start()
-            try:
-                await server.serve()
-            finally:
-                await registers.stop()
-
-    thread = threading.Thread(target=asyncio.run, args=(live(),))
-    thread.start()
-    try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=40) as client:
-            while not server.started or cell.snapshot().phase != "ready":
-                time.sleep(0.005)
+    document: dict[str, Any] = {"control": "rest", "publish": {"modbus": {"host": "127.0.0.1", "port": modbus_port}}} | changes
+    configured = exam.cell("B", calibration={"directory": folder}, timeout_ms=30_000, **document)
+    with recorder(recordings) as recording_it:
+        cell = Cell(configured, RIG, cameras, boot_id=7, recorder=recording_it)
+        with on_a_thread(with_modbus(cell, configured), cell, port) as client:
+            until(lambda: cell.snapshot().phase == "ready", START_S)
             yield Daemon(client, cell, cameras, modbus_port)
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        if recorder is not None:
-            assert recorder.close(10.0)
 
 
 @pytest.mark.parametrize(("rows_px", "code", "level"), [
@@ -352,8 +276,7 @@ def test_who_does_not_control_the_cell_verifies_while_it_is_idle(free_port: int,
         assert refused.status_code == 409
         assert "modbus runs a cycle" in refused.json()["detail"]
         served.cameras.gate.set()
-        while served.cell.snapshot().phase != "ready":
-            time.sleep(0.01)
+        until(lambda: served.cell.snapshot().phase == "ready", START_S)
         with pytest.raises(NotInControl, match="has a result to read"):
             served.cell.verify(Verify(), Request(), "rest")
         assert served.cell.snapshot().valid

@@ -19,11 +19,12 @@ import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+import ports
 from binpick import pipeline, recording
 from binpick import rig as rig_file
 from binpick.rig import Rig
 
-HERE = Path(__file__).parent
+CELL = Path(__file__).parents[1] / "slow_cell.py"
 LIMIT_S = 3.0
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 K = ((300.0, 0.0, 160.0), (0.0, 300.0, 100.0), (0.0, 0.0, 1.0))
@@ -46,13 +47,6 @@ class Daemon:
                     if state.get("phase") == phase or (phase == "valid" and state.get("valid")):
                         return
         pytest.fail(f"the daemon ended before it was {phase}")
-
-
-def free_ports() -> tuple[int, int]:
-    with socket.socket() as one, socket.socket() as other:
-        for probe in (one, other):
-            probe.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
 
 
 @contextmanager
@@ -113,8 +107,8 @@ def page(running: Daemon) -> Iterator[ClientConnection]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("state", STATES)
 def test_a_signal_ends_the_daemon_in_every_state(state: str, number: int, clock: Callable[[], float]) -> None:
-    rest_port, modbus_port = free_ports()
-    command = (str(HERE / "slow_cell.py"), str(rest_port), str(modbus_port), MODES.get(state, "quick"))
+    rest_port, modbus_port = ports.free(2)
+    command = (str(CELL), str(rest_port), str(modbus_port), MODES.get(state, "quick"))
     with (daemon(*command, rest_port=rest_port, clock=clock) as running, socket.create_connection(("127.0.0.1", modbus_port)),
           listening(running) as events, page(running)):
         if state != "starting":
@@ -127,8 +121,8 @@ def test_a_signal_ends_the_daemon_in_every_state(state: str, number: int, clock:
 
 
 def test_a_waiting_client_is_told_and_a_second_signal_exits_at_once(clock: Callable[[], float]) -> None:
-    rest_port, modbus_port = free_ports()
-    command = (str(HERE / "slow_cell.py"), str(rest_port), str(modbus_port), "stuck-capture")
+    rest_port, modbus_port = ports.free(2)
+    command = (str(CELL), str(rest_port), str(modbus_port), "stuck-capture")
     with daemon(*command, rest_port=rest_port, clock=clock) as running:
         running.wait_for("ready")
         waiting = subprocess.Popen([sys.executable, "-c", "import httpx, sys; print(httpx.post(sys.argv[1], timeout=30).text)",
@@ -164,7 +158,7 @@ publish: {{rest: {{port: {rest_port}}}, modbus: {{host: 127.0.0.1, port: {modbus
 
 
 def test_the_command_serves_a_cell_from_files_records_its_cycle_and_stops(tmp_path: Path, clock: Callable[[], float]) -> None:
-    rest_port, modbus_port = free_ports()
+    rest_port, modbus_port = ports.free(2)
     cell = cell_folder(tmp_path, rest_port, modbus_port)
     with daemon("-m", "binpick", "run", "--cell", str(cell), rest_port=rest_port, clock=clock) as running:
         running.wait_for("ready")

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+import staged
 from binpick import geometry, settings
 from binpick.cycle import CycleInput
 from binpick.data import Depth, Frame, Rectified, StereoPair, Window
@@ -125,17 +126,8 @@ def window_type() -> type[Window]:
 
 @pytest.fixture(scope="session")
 def photograph() -> Callable[..., CycleInput]:
-    """photograph(parts, seed): parts (kind, T_bin_part) laid into the exam's small bin, by cameras with 2 for 3 px.
-
-    That is more pixels per millimetre than over the large bin, and half the time.
-    """
-    document = exam.rig("B").model_dump(exclude={"sha256"})
-    document["image_size_px"] = tuple(int(side / 1.5) for side in exam.IMAGE_SIZE_PX)
-    for camera in document["cameras"]:
-        K = np.array(camera["K"]) / [[1.5], [1.5], [1.0]]
-        K[:2, 2] -= 1 / 6     # pixel centres are whole numbers
-        camera["K"] = K.tolist()
-    rig = Rig.model_validate(document)
+    """photograph(parts, seed): parts (kind, T_bin_part) laid into the exam's small bin, by cameras with 2 for 3 px."""
+    rig = staged.small_exam_rig()
     renderer, job = Renderer(rig, "B"), settings.resolve(exam.cell("B"))
 
     def take(parts: Sequence[tuple[str, Transform]] = (), seed: int = 1) -> CycleInput:

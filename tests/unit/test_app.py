@@ -11,24 +11,20 @@ import httpx
 import numpy as np
 import pytest
 
+import staged
 from binpick import app, settings
 from binpick.cli.check import findings
 from binpick.errors import InputError, PortInUse
-from binpick.rig import Rig, dump
+from binpick.rig import dump
+from ports import free
 
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-K = ((300.0, 0.0, 160.0), (0.0, 300.0, 100.0), (0.0, 0.0, 1.0))
-RIG = Rig.model_validate({"image_size_px": (320, 200), "cameras": [
-    {"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
-    for name, T in (("left", EYE), ("right", ((1.0, 0.0, 0.0, -0.15), *EYE[1:])))]})
+RIG = staged.rig((320, 200), 300.0)
 
 
 @pytest.fixture
 def ports() -> tuple[int, int]:
-    with socket.socket() as one, socket.socket() as other:
-        for probe in (one, other):
-            probe.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
+    one, other = free(2)
+    return one, other
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+import printed
 from binpick import geometry, poses, rig
 from binpick.cycle import CycleInput
 from binpick.errors import InputError
@@ -93,16 +94,7 @@ def test_what_is_wrong_with_a_table(tmp_path: Path, lines: list[str], said: str)
 
 
 def draw(T_camera_board: Transform) -> np.ndarray:
-    """A camera's view of a printed board, four times oversampled."""
-    side = 40
-    cells = np.add.outer(np.arange(ROWS + 1), np.arange(COLUMNS + 1)) % 2
-    sheet = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                               cv2.BORDER_CONSTANT, value=210)
-    metres = SQUARE_M / side
-    T_board_sheet = np.array([[metres, 0, (0.5 - 2 * side) * metres], [0, metres, (0.5 - 2 * side) * metres], [0, 0, 1]])
-    H = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1]]) @ K @ T_camera_board[:3, [0, 1, 3]] @ T_board_sheet
-    large = cv2.GaussianBlur(cv2.warpPerspective(sheet, H, (SIZE[0] * 4, SIZE[1] * 4), borderValue=120), None, 3)
-    return cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA)
+    return printed.seen(printed.chessboard(COLUMNS, ROWS), SQUARE_M, K, T_camera_board, SIZE, 4, 3)
 
 
 @pytest.fixture(scope="module")

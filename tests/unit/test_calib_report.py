@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import printed
 from binpick import geometry, rig
 from binpick.errors import InputError
 from binpick.geometry import epipolar
@@ -28,15 +29,7 @@ CHROMIUM = Path("/usr/bin/chromium")
 
 
 def photograph(T_camera_board: np.ndarray) -> np.ndarray:
-    side = 40
-    cells = np.add.outer(np.arange(-1, BOARD.rows), np.arange(-1, BOARD.columns)) % 2
-    sheet = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                               cv2.BORDER_CONSTANT, value=210)
-    metres = BOARD.square_m / side
-    T_board_sheet = np.array([[metres, 0, (0.5 - 2 * side) * metres], [0, metres, (0.5 - 2 * side) * metres], [0, 0, 1]])
-    large = cv2.warpPerspective(sheet, np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]) @ K @ T_camera_board[:3, [0, 1, 3]]
-                                @ T_board_sheet, (2 * SIZE[0], 2 * SIZE[1]), borderValue=120)
-    return cv2.resize(cv2.GaussianBlur(large, None, 1.5), SIZE, interpolation=cv2.INTER_AREA)
+    return printed.seen(printed.chessboard(BOARD.columns, BOARD.rows), BOARD.square_m, K, T_camera_board, SIZE, 2, 1.5)
 
 
 @dataclass(frozen=True)

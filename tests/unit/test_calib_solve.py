@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import printed
 from binpick import geometry, rig
 from binpick.errors import InputError
 from binpick.rigcheck import board as boards
@@ -28,18 +29,8 @@ TILTS_DEG = [(0, 0, 5), (25, 0, 0), (-25, 5, 10), (0, 25, -10), (5, -25, 0), (20
 
 
 def draw(T_camera_board: geometry.Transform) -> np.ndarray:
-    """A camera's view of the printed board, four times oversampled; the board lies on its frame's z = 0."""
-    side = 40
-    cells = np.add.outer(np.arange(-1, BOARD.rows), np.arange(-1, BOARD.columns)) % 2
-    sheet = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                               cv2.BORDER_CONSTANT, value=210)
-    metres = BOARD.square_m / side
-    T_board_sheet = np.array([[metres, 0, (0.5 - 2 * side) * metres], [0, metres, (0.5 - 2 * side) * metres], [0, 0, 1]])
-    H = K @ T_camera_board[:3, [0, 1, 3]] @ T_board_sheet
-    oversampled = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1]]) @ H
-    large = cv2.warpPerspective(sheet, oversampled, (SIZE[0] * 4, SIZE[1] * 4), borderValue=120)
-    large = cv2.GaussianBlur(large, None, 3)    # a lens: 0.75 px; bare steps would move the corners by 0.06 px
-    return cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA)
+    """Through a lens that blurs by 0.75 px; bare steps would move the corners by 0.06 px."""
+    return printed.seen(printed.chessboard(BOARD.columns, BOARD.rows), BOARD.square_m, K, T_camera_board, SIZE, 4, 3)
 
 
 @pytest.fixture(scope="module")

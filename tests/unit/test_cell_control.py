@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
+import staged
 from binpick import health, pipeline, settings
 from binpick.camera.group import CameraGroup
 from binpick.cell import Cell, worker
@@ -29,20 +30,8 @@ from binpick.errors import (
     UnknownItem,
 )
 from binpick.result import PartMessage, Request, Result, ReturnCode, Snapshot
-from binpick.rig import Rig
 from binpick.settings import Bin, Pose, Recipe
 from binpick.sim.camera import SimCamera
-
-K = ((100.0, 0.0, 16.0), (0.0, 100.0, 12.0), (0.0, 0.0, 1.0))
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-RIGHT = ((1.0, 0.0, 0.0, -0.15), *EYE[1:])
-
-
-def rig() -> Rig:
-    return Rig.model_validate({
-        "image_size_px": (32, 24),
-        "cameras": [{"name": name, "K": K, "distortion": (0, 0, 0, 0), "T_cam_rig": T}
-                    for name, T in (("left", EYE), ("right", RIGHT))]})
 
 
 def cell_settings(**changes: object) -> settings.Cell:
@@ -107,7 +96,7 @@ def good(inputs: CycleInput, proceed: Callable[[], None]) -> CycleResult:
 @asynccontextmanager
 async def living(cameras: TestCameras, run: Callable[[CycleInput, Callable[[], None]], CycleResult] = good,
                  ready: bool = True, pose: PoseStep = pipeline.poses, **changes: object) -> AsyncIterator[Cell]:
-    cell = Cell(cell_settings(**changes), rig(), cameras, run, boot_id=7, pose=pose)
+    cell = Cell(cell_settings(**changes), staged.rig(), cameras, run, boot_id=7, pose=pose)
     async with cell:
         if ready:
             await until(cell, lambda s: s.phase == "ready")
@@ -400,7 +389,7 @@ def test_two_cameras_killed_in_mid_cycle_fail_it_within_two_seconds_by_name(fail
     async def scenario() -> None:
         eyes = (SimCamera(0, expose, sleep=sleep), SimCamera(1, expose, sleep=sleep))
         slow = cell_settings(recipes=[Recipe(frame="camera", exposure_us=300_000)])
-        cell = Cell(slow, rig(), CameraGroup(eyes, 5000.0), good, boot_id=7)
+        cell = Cell(slow, staged.rig(), CameraGroup(eyes, 5000.0), good, boot_id=7)
         async with cell:
             await until(cell, lambda s: s.phase == "ready")
             cell.start(Request(), "rest")
@@ -427,7 +416,7 @@ def test_an_idle_cameras_death_and_return_need_no_trigger(monkeypatch: pytest.Mo
 
     async def scenario() -> None:
         eyes = tuple(SimCamera(index, lambda *_: np.zeros((24, 32), np.uint8)) for index in (0, 1))
-        async with Cell(cell_settings(), rig(), CameraGroup(eyes, 5000.0), good, boot_id=7) as cell:
+        async with Cell(cell_settings(), staged.rig(), CameraGroup(eyes, 5000.0), good, boot_id=7) as cell:
             await until(cell, lambda s: s.phase == "ready")
             eyes[1].fail = "dead"
             shown = await until(cell, lambda s: s.phase == "starting")
@@ -449,7 +438,7 @@ def test_a_death_is_told_while_poses_are_computed() -> None:
         return cycle
 
     async def scenario() -> None:
-        async with Cell(cell_settings(), rig(), CameraGroup(eyes, 5000.0), good, boot_id=7, pose=pose) as cell:
+        async with Cell(cell_settings(), staged.rig(), CameraGroup(eyes, 5000.0), good, boot_id=7, pose=pose) as cell:
             await until(cell, lambda s: s.phase == "ready")
             cell.start(Request(), "rest")
             try:
@@ -541,7 +530,7 @@ def test_a_controller_that_goes_away_takes_its_cycle_along() -> None:
 def test_stopping_ends_waiters_at_once_and_abandons_a_stuck_worker() -> None:
     async def scenario() -> None:
         cameras = TestCameras()
-        cell = Cell(cell_settings(), rig(), cameras, good, boot_id=7)
+        cell = Cell(cell_settings(), staged.rig(), cameras, good, boot_id=7)
         cell.launch()
         await until(cell, lambda s: s.phase == "ready")
         cell.start(Request(), "rest")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+import staged
 from binpick import settings
 from binpick.cell import machine, watchdog
 from binpick.cell.machine import State
@@ -11,7 +12,6 @@ from binpick.data import CameraStatus
 from binpick.errors import Busy, Code, NotInControl, NotReady
 from binpick.message import CalibrationMessage, Level, Verify
 from binpick.result import Published, Request, Result, ReturnCode
-from binpick.rig import Rig
 from binpick.rigcheck import correction
 from binpick.rigcheck.drift import Level as DriftLevel
 from binpick.rigcheck.drift import Watch
@@ -22,17 +22,7 @@ from binpick.settings.cell import ReferenceMarks, Watchdog
 S = 1_000_000_000
 JOB = settings.resolve(settings.Cell(bins=(Bin(inner_size_m=(0.6, 0.4, 0.18), pose=Pose()),)))
 READY = State(max_age_ns=10 * S, cameras=(CameraStatus("left", True),))
-EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-
-
-def rig(focal_px: float = 1000.0) -> Rig:
-    K = ((focal_px, 0.0, 500.0), (0.0, focal_px, 300.0), (0.0, 0.0, 1.0))
-    return Rig.model_validate({"image_size_px": (1000, 600), "cameras": [
-        {"name": name, "K": K, "distortion": (0.0,) * 4, "T_cam_rig": T}
-        for name, T in (("left", EYE), ("right", ((1.0, 0.0, 0.0, -0.15), *EYE[1:])))]})
-
-
-RIG = rig()
+RIG = staged.rig((1000, 600), 1000.0)
 _, CORRECTION = correction.applied(RIG, (0.001, 0.0, 0.0))
 FRESH = Guard(rig_sha256=RIG.sha256)
 WATCHED = watchdog.watching(READY, FRESH)
@@ -85,7 +75,7 @@ def test_where_nobody_watches_nothing_is_kept() -> None:
 
 
 def test_another_rig_file_starts_anew() -> None:
-    other = rig(1010.0)
+    other = staged.rig((1000, 600), 1010.0)
     state = watchdog.keep(WATCHED, 1, FRESH, seen("fault"), said("fault", 2.0))
     assert state.guard is not None
     corrected = replace(state, guard=state.guard.model_copy(update={"correction": CORRECTION}))

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+import printed
 from binpick import geometry
 from binpick.data import Image
 from binpick.errors import InputError
@@ -167,10 +168,7 @@ def test_twelve_samples_of_the_exams_rig(mounting: str, seed: int) -> None:
 
 def photograph(T_rig_board: Transform, camera: int, board: Board, rng: np.random.Generator) -> Image:
     """A camera's image of the drawn chessboard, through its lens, three rays each way for a pixel; blurred, with noise."""
-    side = 40
-    cells = np.add.outer(np.arange(board.rows + 1), np.arange(board.columns + 1)) % 2
-    drawn = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                               cv2.BORDER_CONSTANT, value=210)
+    drawn, side = printed.chessboard(board.columns, board.rows), printed.SIDE_PX
     lens = RIG.cameras[camera]
     T = lens.T_camera_rig @ T_rig_board
     outline = np.array([[x, y, 0.0] for x in (-2, board.columns + 1) for y in (-2, board.rows + 1)]) * board.square_m

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import printed
 from binpick.errors import InputError
 from binpick.rigcheck import chessboard, sight
 from binpick.rigcheck.board import Board, Kind, parse
@@ -68,16 +69,13 @@ def test_dots_photographed() -> None:
     assert all(isinstance(seen, Detection) for seen in found)
 
 
-def sheet(board: Board, side: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """A drawn board, `side` pixels for `square_m`, and the pixel of its first point."""
+def sheet(board: Board) -> tuple[np.ndarray, np.ndarray]:
+    """A drawn board, and the pixel of its first point."""
+    side = printed.SIDE_PX
     if board.kind is Kind.CHARUCO:
-        width, height = (board.columns + 1) * side, (board.rows + 1) * side
-        drawn = board.charuco.generateImage((width, height), marginSize=0) // 255 * 190 + 20
-        drawn = cv2.copyMakeBorder(drawn.astype(np.uint8), *[side] * 4, cv2.BORDER_CONSTANT, value=210)
+        drawn = printed.charuco(board.charuco)
     elif board.kind is Kind.CHESSBOARD:
-        cells = np.add.outer(np.arange(board.rows + 1), np.arange(board.columns + 1)) % 2
-        drawn = cv2.copyMakeBorder(np.kron(cells, np.ones((side, side))).astype(np.uint8) * 190 + 20, *[side] * 4,
-                                   cv2.BORDER_CONSTANT, value=210)
+        drawn = printed.chessboard(board.columns, board.rows)
     else:
         places = board.points_m[:, :2] / board.square_m * side + 2 * side
         drawn = np.full((*(places.max(0)[::-1].astype(int) + 2 * side),), 210, np.uint8)
@@ -91,9 +89,8 @@ def sheet(board: Board, side: int = 40) -> tuple[np.ndarray, np.ndarray]:
 def photograph(board: Board, tilt_deg: tuple[float, float, float] = (20.0, 15.0, 8.0), blur_px: float = 0.8, shade: float = 1.0,
                noise: float = 2.0, shift_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """A camera's view of the drawn board, with light falling off to one side, and where its points truly are."""
-    side = 40
-    drawn, first = sheet(board, side)
-    metres = board.square_m / side
+    drawn, first = sheet(board)
+    metres = board.square_m / printed.SIDE_PX
     R = Rotation.from_euler("xyz", tilt_deg, degrees=True).as_matrix()
     points = board.points_m.astype(float)
     middle = np.array([0.01 + shift_m, 0.005, 2.2 * np.ptp(points, axis=0).max()])
