@@ -180,7 +180,8 @@ def depth_error(rig: Rig, at: Cell, shot: int) -> Errors:
     asked = regions(true, {part.part_id: part.kind for part in at.scene.parts}).parts & true.visible_both
     z, true_z = (pair.focal_px * pair.baseline_m / disparity[asked] for disparity in (measured.disparity, true.disparity))
     off = np.abs(z - true_z)[np.isfinite(z)]
-    return {"depth_error_mm": _mm(float(np.median(off))) if off.size else None, "measured": round(off.size / int(asked.sum()), 3)}
+    median_m = float(np.median(off)) if off.size else float("nan")
+    return {"depth_error_mm": _mm(median_m), "measured": round(off.size / int(asked.sum()), 3)}
 
 
 def calm(world: str, seeds: Sequence[int], light: Light, cycles: int,

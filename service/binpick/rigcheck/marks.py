@@ -104,7 +104,8 @@ def compare(reference: Reference, sightings: Sequence[Sighting], rig: Rig) -> Ma
     return _solved(reference, views, rig, len(common), missing)
 
 
-_View: TypeAlias = tuple[Points, Pixels, tuple[int, ...]]
+_View: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 2"], tuple[int, ...]]
+"""What one camera sees: points, their places, the marks; each camera sees as many as it does."""
 
 
 def _gathered(reference: Reference, sightings: Sequence[Sighting], camera: int) -> _View:
