@@ -90,7 +90,7 @@ def stands(touched: Touched, size_m: tuple[float, float, float]) -> Transform:
                          "named rim and floor")
     if abs(height_m - size_m[2]) > FITS_M:
         raise InputError(f"the floor lies {1000 * height_m:.1f} mm below the rim, the bin's inner height is "
-                         f"{1000 * size_m[2]:.1f} mm")
+                         f"{1000 * size_m[2]:.1f} mm: check both, and the unit of the points")
     T_base_rim = geometry.frame_of_axes(z, axes[0], middle)
     flat = geometry.transform(geometry.inverse(T_base_rim), touched.rim)
     length, width, _ = size_m

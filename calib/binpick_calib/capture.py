@@ -21,11 +21,15 @@ CAMERAS = ("left", "right", "third", "fourth", "fifth")
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What became of a moment: `said` is why it was taken or was not; `taken` its number in the folder, 0: not taken."""
+    """What became of a moment: `said` is why it was taken or was not; `taken` its number in the folder, 0: not taken.
+
+    `waits`: there was no moment yet, `said` is what it waits for.
+    """
 
     coverage: Coverage
     said: str
     taken: int = 0
+    waits: bool = False
 
 
 Show = Callable[[Step], None]
@@ -43,7 +47,7 @@ def capture(moments: Iterable[Moment | str], board: Board, out: Path, coverage: 
     try:
         for moment in moments:
             if isinstance(moment, str):
-                show(Step(coverage, moment))
+                show(Step(coverage, moment, waits=True))
                 continue
             coverage = _named(coverage, moment)
             seen, reasons = look(moment.images, board, sight.glance if moment.live else sight.find)

@@ -176,7 +176,7 @@ def hand_eye(
     right: Annotated[str, typer.Option(metavar="GLOB", help="Images of the right camera.")] = "",
     pose_format: Annotated[str, typer.Option(metavar="NAME", help=f"The angles, if the table's head does not tell: "
                                                                   f"{', '.join(known.name for known in PoseFormat)}.")] = "",
-    unit: Annotated[Literal["", "mm", "m"], typer.Option(help="Of positions, where the head does not tell.")] = "",
+    unit: Annotated[Literal["", "mm", "m"], typer.Option(metavar="mm|m", help="Of positions, if the head does not tell.")] = "",
     z: Annotated[float | None, typer.Option(metavar="M", help="For robots with four axes: height of the board's first point in "
                                             "the flange (cameras on the base), else in the base.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
@@ -205,7 +205,7 @@ def carrier(
     points: Annotated[Path | None, typer.Option(metavar="FILE", help="Points touched, in the robot's base, .csv: name,x_mm,"
                                                 "y_mm,z_mm; three or four named rim (inner corners), one floor.")] = None,
     size: Annotated[str, typer.Option(metavar="LxWxH", help="Inner size, metres: 0.6x0.4x0.18; or give --cell.")] = "",
-    unit: Annotated[Literal["", "mm", "m"], typer.Option(help="Of the points, where the head does not tell.")] = "",
+    unit: Annotated[Literal["", "mm", "m"], typer.Option(metavar="mm|m", help="Of points, if the head does not tell.")] = "",
     locate: Annotated[bool, typer.Option("--locate", help="Instead of points: see the rim in a pair of images.")] = False,
     left: Annotated[Path | None, typer.Option(metavar="FILE", help="The left image.")] = None,
     right: Annotated[Path | None, typer.Option(metavar="FILE", help="The right image.")] = None,

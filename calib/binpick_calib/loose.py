@@ -60,6 +60,8 @@ def _entries(path: Path) -> Iterator[tuple[str, Float[np.ndarray, "..."]]]:
             yield from _storage(path)
         else:
             raise InputError(f"{path}: known are .npy, .npz, .yml, .yaml and .xml")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file") from error
     except (OSError, ValueError, cv2.error, SystemError) as error:
         raise InputError(f"{path}: cannot be read as OpenCV or numpy parameters") from error
 

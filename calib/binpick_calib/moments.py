@@ -92,8 +92,11 @@ def of_folder(left: str, right: str) -> Moments:
     done: set[tuple[Path | None, ...]] = set()
     while True:
         fresh: list[viewing.Shot] = []
-        with contextlib.suppress(InputError):       # nothing there yet, or half a pair
+        waiting = f"waiting for images {left} and {right}"
+        try:
             fresh = [shot for shot in viewing.match(left, right)[0] if shot.files not in done]
+        except InputError as error:       # nothing there yet, half a pair, or names that will never do
+            waiting = f"{waiting}: {error}"
         for shot in fresh:
             images = [viewing.read(path) for path in shot.files if path is not None]
             if any(image is None for image in images):
@@ -102,7 +105,7 @@ def of_folder(left: str, right: str) -> Moments:
             done.add(shot.files)
             yield Moment(tuple(image for image in images if image is not None), str(shot.number), live=False)
         if not fresh:
-            yield f"waiting for images {left} and {right}"
+            yield waiting
             time.sleep(PAUSE_S)
 
 

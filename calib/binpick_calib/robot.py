@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from binpick import geometry, poses
+from binpick.calibration import REACH_M
 from binpick.errors import InputError
 from binpick.geometry import Transform
 from binpick.poses import PoseFormat
@@ -21,8 +22,6 @@ COLUMNS = {("qx", "qy", "qz", "qw"): PoseFormat.quaternion_xyzw, ("q1", "q2", "q
            ("a", "b", "c"): PoseFormat.kuka_abc_deg, ("w", "p", "r"): PoseFormat.fanuc_wpr_deg,
            ("rx", "ry", "rz"): PoseFormat.ur_rxryrz_rad}
 """How heads of columns name an orientation; ABB's q1 is the real part."""
-REACH_M = 10.0
-"""No flange is further from its base."""
 
 
 class Row(NamedTuple):

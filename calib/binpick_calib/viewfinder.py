@@ -39,7 +39,8 @@ class Viewfinder:
             self._live.update(picture(step))
             return
         views = len(step.coverage.views)
-        line = f"view {views} of {step.coverage.wanted}: {step.said}" if step.taken else f"not taken: {step.said}"
+        line = (f"view {views} of {step.coverage.wanted}: {step.said}" if step.taken
+                else step.said if step.waits else f"not taken: {step.said}")
         if line != self._last:
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
             self._last = line

@@ -14,6 +14,8 @@ from binpick.rig import Quality, Rig, digest
 
 Mounting = Literal["base", "flange"]
 MOST_VERSIONS = 9999
+REACH_M = 10.0
+"""No flange is further from its base: a position in millimetres is."""
 
 
 class SampleRequest(Wire):

@@ -176,6 +176,9 @@ def test_from_samples_to_a_rig_that_knows_the_robot(free_port: int, tmp_path: Pa
         async with site(free_port, tmp_path) as here:
             assert "no board is named" in await here.refused("calibration/samples", {}, 422, Code.BAD_ARGUMENT)
             assert "no sample" in await here.refused("calibration/handeye", {"mounting": "base"}, 422, Code.BAD_ARGUMENT)
+            millimetres = {"board": BOARD, "T_base_flange": {"position_m": [400, 0, 300], "quaternion_xyzw": [0, 0, 0, 1]}}
+            said = await here.refused("calibration/samples", millimetres, 422, Code.BAD_ARGUMENT)
+            assert "the flange would be 500 m from its base: positions are in metres" in said
             for stand in range(6):
                 response = await here.sample(stand)
                 assert response.status_code == 201, response.text
@@ -309,6 +312,10 @@ def test_command_7_takes_samples_with_the_flange_pose_of_the_registers(free_port
             assert await here.plc.sample(None) == (Code.NO_FLANGE_POSE, 0)
             await here.plc.clear()
             assert await here.plc.sample(flange(0)) == (Code.BOARD_NOT_FOUND, 12)
+            millimetres = flange(0).copy()
+            millimetres[:3, 3] *= 1000
+            assert (await here.plc.sample(millimetres))[0] == Code.BAD_ARGUMENT
+            await here.plc.clear()
             here.cameras.stand, here.cameras.covered = 0, True
             assert await here.plc.sample(flange(0)) == (Code.BOARD_NOT_FOUND, 11)
             here.cameras.covered = False

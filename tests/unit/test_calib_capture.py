@@ -17,7 +17,7 @@ from binpick.rigcheck import board as boards
 from binpick.rigcheck.coverage import Coverage
 from binpick_calib import capture, cli, session
 from binpick_calib.capture import Step
-from binpick_calib.moments import Moment
+from binpick_calib.moments import Moment, of_folder
 from binpick_calib.viewfinder import Viewfinder, picture
 
 BOARD = boards.parse("chessboard:9x6:0.025")
@@ -66,6 +66,22 @@ def test_what_a_folder_fills_up_with_is_captured_and_solves(shown_board: Any, pa
     assert solved["focal_px"]["left"] == pytest.approx([620, 622], rel=0.001)
     assert solved["baseline_m"] == pytest.approx(np.linalg.norm(shown_board.T_right_left[:3, 3]), abs=0.0001)
     assert rig.load(tmp_path / "rig.json")[0].image_size_px == shown_board.size
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    ((), "no file is called so"),
+    (("l1a.png", "l1b.png", "r1a.png", "r1b.png"), "two images of one side carry the same number"),
+    (("l1.png", "r2.png"), "no left and right image carry the same number")])
+def test_a_folder_that_gives_no_pair_says_why(names: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / name).touch()
+    waiting = next(of_folder(str(tmp_path / "l*.png"), str(tmp_path / "r*.png")))
+    assert isinstance(waiting, str)
+    assert said in waiting
+    told = io.StringIO()
+    with Viewfinder(Console(file=told, width=300)) as finder:
+        capture.capture(iter([waiting]), BOARD, tmp_path, Coverage(), finder.show)
+    assert told.getvalue().startswith("waiting for images ")
 
 
 def live(images: list[tuple[np.ndarray, np.ndarray] | None], dropped: list[str]) -> Iterator[Moment | str]:

@@ -197,6 +197,7 @@ def test_a_bin_touched_with_the_robot(tmp_path: Path, monkeypatch: pytest.Monkey
     (["rim,0,0,200", "rim,300,0,200", "rim,600,1,200", "floor,100,100,20"], "lie on one line"),
     (["rim,0,0,20", "rim,600,0,20", "rim,600,400,20", "floor,100,100,200"], "the floor lies 180 mm above the rim"),
     (["rim,0,0,200", "rim,600,0,200", "rim,600,400,200", "floor,100,100,50"], "150.0 mm below the rim, the bin's inner height"),
+    (["rim,0,0,0", "rim,600000,0,0", "rim,600000,400000,0", "floor,9,9,-180000"], "check both, and the unit of the points"),
     (["rim,0,0,200", "rim,500,0,200", "rim,500,400,200", "floor,100,100,20"], "they are 400, 500, 640 mm apart"),
     (["rim,0,0,200", "rim,600,0,200", "floor,100,100,20"], "2 points of the rim and 1 of the floor"),
     (["wall,0,0,200"], "touched.csv:2: 'wall': name each point rim"),

@@ -95,3 +95,11 @@ def test_unreadable_files(content: str | None, tmp_path: Path, monkeypatch: pyte
         path.write_text(content)
     assert run(monkeypatch, str(path), "--image-size", "640x480", "--unit-m", "1", "--out", str(tmp_path / "rig.json")) == 2
     assert str(path) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "yml"])
+def test_a_file_that_is_not_there(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                  capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / f"M1.{kind}"
+    assert run(monkeypatch, str(path), "--image-size", "640x480", "--unit-m", "1", "--out", str(tmp_path / "rig.json")) == 2
+    assert f"{path}: there is no such file" in capsys.readouterr().err

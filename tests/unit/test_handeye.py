@@ -302,6 +302,21 @@ def test_what_is_missing_is_named() -> None:
         handeye.solve(strewn, RIG, "base")
 
 
+def test_the_wrong_mounting_that_agrees_to_some_millimetres() -> None:
+    """A board tilted this way and that about one stand, and never turned in its plane: enough samples fit both ways."""
+    rng, middle, samples = np.random.default_rng(1), BOARD.points_m.mean(0).astype(float), []
+    tilts = [(0, 0), (25, 0), (-25, 0), (0, 25), (0, -25), (28, 5), (-28, 5), (5, 28), (5, -28), (0, 0)]
+    places = [(0.07, 0, 0.85), (-0.02, -0.09, 0.82), (0.17, -0.09, 0.84), (-0.03, 0.1, 0.8), (0.18, 0.1, 0.8),
+              (0.07, -0.1, 0.78), (0.07, 0.1, 0.78), (-0.02, 0, 0.8), (0.17, 0, 0.8), (0.07, 0, 0.75)]
+    for number, (tilt, where) in enumerate(zip(tilts, places, strict=True), start=1):
+        R = Rotation.from_euler("xy", tilt, degrees=True).as_matrix()
+        T = geometry.make(R, np.array(where) - R @ middle)
+        samples.append(Sample(str(number), robot(flange(T, "base"), rng), corners(T, BOARD, rng)))
+    assert handeye.solve(samples, RIG, "base").rms_m < 0.001
+    with pytest.raises(InputError, match=r"With the rig mounted the other way.* they agree to 0\.\d mm"):
+        handeye.solve(samples, RIG, "flange")
+
+
 def test_the_same_samples_give_the_same_bytes() -> None:
     first, again = (handeye.solve(taken(10, "flange"), RIG, "flange") for _ in range(2))
     assert first.T_flange_rig.tobytes() == again.T_flange_rig.tobytes()

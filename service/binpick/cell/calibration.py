@@ -1,6 +1,7 @@
 """Calibration in the running cell: samples of a board, the hand-eye made of them, and which version of the rig is in use."""
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ import cv2
 
 from binpick import settings
 from binpick.calibration import (
+    REACH_M,
     CalibrationState,
     HandEyeAnswer,
     HandEyeRequest,
@@ -65,6 +67,8 @@ class Calibration:
     def sample(self, request: SampleRequest, source: Source) -> int:
         """Starts to take a sample and returns the cycle's id at once."""
         try:
+            if request.T_base_flange and (far_m := math.hypot(*request.T_base_flange.position_m)) > REACH_M:
+                raise InputError(f"the flange would be {far_m:.0f} m from its base: positions are in metres")
             wanted = request.model_copy(update={"board": self._board_of(request)})
             self.store.admit()
             job = settings.resolve(self.cell, request.recipe)

@@ -24,6 +24,8 @@ AGREEING = 0.6
 """Share of the samples that must agree."""
 WORST_M = 0.010
 """Where robot and cameras disagree by more than this (rms), no grasp would be where it is said to be."""
+DOUBTFUL_M = 0.001
+"""The wrong mounting may agree to some millimetres, where the flange turned little: beyond this the other one is tried."""
 OUTLYING, PRECISE_M = 3.0, 0.0002
 """A sample is left out beyond so many times the median distance, which counts as no less than this: robots repeat to 0.1 mm."""
 ROUNDS = 10
@@ -131,6 +133,8 @@ def solve(samples: Sequence[Sample], rig: Rig, mounting: Mounting, z_m: float | 
                                                                                       strict=True))
     if len(used) < max(FEWEST, AGREEING * len(views)) or rms_m > WORST_M:
         raise InputError(_disagreement(views, used, rms_m, case))
+    if len(used) < len(views) or rms_m > DOUBTFUL_M:
+        _refuse_other_mounting(views, rms_m, case)
     views_used = [views[i] for i in used]
     outliers = {sample.name: "no camera sees the board" for sample in samples if not any(sample.seen)}
     outliers |= {view.name: _why(view, views_used, found, residuals[view.name], rms_m, case)
@@ -239,10 +243,23 @@ def _disagreement(views: Sequence[View], used: Sequence[int], rms_m: float, case
     names = ", ".join(view.name for i, view in enumerate(views) if i not in used)
     told = (f"only {len(used)} of {len(views)} samples agree (not {names})" if names else "robot and cameras disagree") + \
         f", to {1000 * rms_m:.1f} mm; {max(FEWEST, round(AGREEING * len(views)))} must agree to {1000 * WORST_M:.0f} mm. "
-    other = loop.guess([geometry.inverse(view.T_carrier_mount) for view in views], [[view.T_rig_board] for view in views],
-                       1, case.solver, corners(case.board))
-    if other is not None and other.score_m < min(WORST_M, rms_m / 3):
-        return told + (f"With the rig mounted the other way, on flange or base, they agree to {1000 * other.score_m:.1f} mm: "
-                       "check the mounting, and that the poses are those of the flange in the base")
+    if hint := _other_mounting(views, rms_m, case):
+        return told + hint
     return told + ("Check that each pose belongs to its images, that it is the flange's (no tool set), its unit and its kind "
                    "of angles, the board's size, and that rig and board sit tight")
+
+
+def _refuse_other_mounting(views: Sequence[View], rms_m: float, case: _Case) -> None:
+    """Raises InputError where the other mounting explains the same samples far better. Not for four axes: half is unseen."""
+    if case.z_m is None and (hint := _other_mounting(views, rms_m, case)):
+        raise InputError(f"robot and cameras agree to {1000 * rms_m:.1f} mm only. {hint}")
+
+
+def _other_mounting(views: Sequence[View], rms_m: float, case: _Case) -> str:
+    """What to check when the samples agree much better with the rig mounted the other way; "" when they do not."""
+    other = loop.guess([geometry.inverse(view.T_carrier_mount) for view in views], [[view.T_rig_board] for view in views],
+                       1, case.solver, corners(case.board))
+    if other is None or other.score_m >= min(WORST_M, rms_m / 3):
+        return ""
+    return (f"With the rig mounted the other way, on flange or base, they agree to {1000 * other.score_m:.1f} mm: "
+            "check the mounting, and that the poses are those of the flange in the base")

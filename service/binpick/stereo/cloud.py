@@ -13,7 +13,9 @@ def reproject(depth: Depth, rectified: Rectified) -> OrganisedCloud:
     u = (np.arange(view.width) + (view.x - rectified.cx_px)).astype(np.float32)
     v = (np.arange(view.height) + (view.y - rectified.cy_px)).astype(np.float32)
     depth_scale = np.float32(rectified.focal_px * rectified.baseline_m)
-    f, z = np.float32(rectified.focal_px), depth_scale / depth.disparity
+    f = np.float32(rectified.focal_px)
+    with np.errstate(divide="ignore"):      # a surface at infinity has the disparity 0
+        z = depth_scale / depth.disparity
     rect = cv2.merge([z * (u / f)[None, :], z * (v / f)[:, None], z])
     xyz = geometry.transform(rectified.T_camera_rect, rect)
     sigma_z_m = z * z * depth.sigma_px / depth_scale
