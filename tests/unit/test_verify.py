@@ -145,3 +145,12 @@ def test_document_is_json(rig: Rig) -> None:
     assert document["offset_m"] is None
     assert document["level"] == "ok"
     assert abs(document["row_px"]) < 0.05
+
+
+def test_images_that_are_no_pair_of_this_rig_are_no_verdict(rig: Rig) -> None:
+    left, right = look(rig, rig.cameras[1].T_camera_rig)
+    with pytest.raises(InputError, match="left and right are exchanged"):
+        verify((right, left), rig)
+    _, later = look(rig, rig.cameras[1].T_camera_rig, T=geometry.translation(0.0, 0.1, 0.0) @ T_RIG_BOARD)
+    with pytest.raises(InputError, match="not of one moment"):
+        verify((left, later), rig)

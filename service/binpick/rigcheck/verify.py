@@ -16,18 +16,26 @@ from binpick.rigcheck.detection import Detection, Refusal
 from binpick.rigcheck.rows import Rows
 from binpick.rigcheck.verdict import LIMITS, Limits, Verdict, judged
 
+MOST_PX = 40.0
+"""Rows further apart are no drift: such images are not of one moment, or not of these two cameras."""
+
 
 def verify(detections: Sequence[Detection | None], rig: Rig, expected: Transform | None = None,
            limits: Limits = LIMITS) -> Verdict:
     """The verdict by a board, anywhere in the view of the rig's first two cameras.
 
     `expected` is T_rig_board as it was, for a board that stands where it stood. Raises InputError when the cameras do not both
-    see the board, or the images are of another size than the rig's.
+    see the board, the images are of another size than the rig's, or cannot be a pair of it.
     """
     left, right = _pair(detections, rig)
     rays = _rays(left, right, rig)
     rows = _rows(*rays)
     places = _places(*rays)
+    if np.median(places[:, 2]) <= 0:
+        raise InputError("the board would lie behind the cameras: left and right are exchanged")
+    if abs(rows.row_px) > MOST_PX:
+        raise InputError(f"the rows of the two images are {abs(rows.row_px):.0f} px apart: they are not of one moment, or not "
+                         "of this rig's cameras")
     scale, T_rect_board, sigma_permille = _similar(left.points_m, places)
     T_rig_board = _rig_rect(rig) @ T_rect_board
     seen = Verdict(str(left.board), len(places), float(np.linalg.norm(places.mean(0))), rows,
