@@ -166,7 +166,7 @@ def test_the_level_is_the_same_on_every_interface(free_port: int, pictures: Pict
 def test_a_controller_reads_it_from_the_registers(free_port: int, pictures: Pictures, rows_px: float,
                                                   code: Code, tmp_path: Path) -> None:
     with daemon(free_port, pictures, tmp_path, rows_px=rows_px, control="modbus") as served:
-        *_, last = (result for _ in range(ENOUGH) for result in served.by_plc("pick")[0])
+        *_, last = served.by_plc(*["pick"] * ENOUGH)[0]
         assert last.return_code == code
         assert bool(last.records) is code.carries_poses
         (verified,), status, registers = served.by_plc("verify")

@@ -40,7 +40,9 @@ class Stream:
         if sends:
             self._pace(conditions)
             block = Block(shot.block, stamp, payload, self._registers.integer("GevSCPSPacketSize"))
-            self.sender.send(block, self._target(), led=self._led == shot.number)
+            target = self._target()
+            if target[1]:           # closed since a moment ago: nobody listens at port 0
+                self.sender.send(block, target, led=self._led == shot.number)
 
     def _pace(self, conditions: Conditions) -> None:
         """A limit below the link's speed counts; the simulated wire is faster than a real one unless it is told not to be."""
