@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 from binpick.data import Light
 from binpick.sim.gige import auto, numbered, pixels
+from binpick.sim.gige.conditions import Conditions
+from binpick.sim.gige.ledger import Ledger
 from binpick.sim.gige.numbered import Numbered
+from binpick.sim.gige.registers import Registers
+from binpick.sim.gige.sensor import Shot
+from binpick.sim.gige.stream import Stream
 from binpick.sim.gige.transit import REACH, Transit
 
 LIGHT = Light(1000.0, 0.0, False)
@@ -98,3 +103,11 @@ def test_auto_exposure_settles(start_us: float) -> None:
     assert auto.exposure_us(5000.0, 0.0, 20.0, 100_000.0) == 100_000.0
     assert auto.gain_db(0.0, 50.0, 0.0, 24.0) == pytest.approx(6.0)
     assert auto.gain_db(3.0, 250.0, 0.0, 24.0) == 0.0
+
+
+def test_an_image_whose_channel_was_closed_meanwhile_goes_nowhere() -> None:
+    stream = Stream(0, "127.0.0.1", Registers("127.0.0.1", 16, 16, "S"), Ledger(1), lambda ns: ns)
+    try:
+        stream.deliver(Shot(1, 1, 0, LIGHT), IMAGE, Conditions(), wanted=True)
+    finally:
+        stream.sender.close()
